@@ -164,8 +164,11 @@ pub async fn publish_asset(
         run_blocking(move || {
             let _permit = permit;
             let scene = read(&push, &request.files, &files, &SourceAxes::default(), bounds)?;
-            let (hashes, options) = (scene.hashes, scene.options);
-            let source = AssetSource { gaussians: scene.gaussians, hashes, options };
+            let source = AssetSource {
+                gaussians: scene.gaussians,
+                hashes: scene.hashes,
+                options: scene.options,
+            };
             make_asset(source, &request.settings)
         })
     };

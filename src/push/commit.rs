@@ -31,8 +31,8 @@ pub(crate) fn merge_profile(
     base: Option<&Version>,
     antialiasing: Option<&Antialiasing>,
 ) -> Result<(RenderProfile, Option<String>), PushError> {
-    let of_files = FileNotes { antialiasing: antialiasing.cloned(), ..FileNotes::default() };
-    let of_files = of_files.profile();
+    let notes = FileNotes { antialiasing: antialiasing.cloned(), ..FileNotes::default() };
+    let of_files = notes.profile();
     // An existing twin keeps its profile: cells of other pushes were trained for it. Only a new
     // twin takes that of its files.
     let own = match base {
@@ -40,8 +40,8 @@ pub(crate) fn merge_profile(
         None => of_files.apply(RenderProfile::DEFAULT).map_err(StoreError::from)?,
     };
     let profile = profile_with(own, &request.profile).map_err(StoreError::from)?;
-    let is_asked = |key: &str| request.profile.iter().any(|setting| setting.starts_with(key));
-    let is_asked = is_asked("antialiased=") || is_asked("blur=");
+    let sets = |key: &str| request.profile.iter().any(|setting| setting.starts_with(key));
+    let is_asked = sets("antialiased=") || sets("blur=");
     let warning = antialiasing.filter(|_| !is_asked).and_then(|said| {
         let Antialiasing { blur_px2, said_by } = said;
         let antialiased = profile.antialiased;

@@ -168,8 +168,10 @@ async fn check(
         let progress = |done, total| push.set_progress(done, total);
         // The poses are in the frame of the files, and the images in that of the twin.
         let alignment = request.frame.alignment(base.as_deref())?.unwrap_or(Alignment::IDENTITY);
-        let poses = request.preview_poses.as_ref();
-        let poses = poses.map(|poses| poses.iter().map(|pose| alignment.pose(pose)).collect());
+        let poses = request
+            .preview_poses
+            .as_ref()
+            .map(|poses| poses.iter().map(|pose| alignment.pose(pose)).collect());
         scene.report.preview = preview_psnr(engine, changed, poses, frames_by, &progress).await?;
         push.set_report(scene.report.clone());
     }
@@ -208,8 +210,8 @@ fn compare_cells(
     }
     check_density(counts.len(), gaussians.len() as u64)
         .inspect_err(|_| push.set_report(report.clone()))?;
-    let changes = CellChanges::new(&request.cells, base.map(|base| &base.manifest), &counts);
-    let changes = changes.inspect_err(|_| push.set_report(report.clone()))?;
+    let changes = CellChanges::new(&request.cells, base.map(|base| &base.manifest), &counts)
+        .inspect_err(|_| push.set_report(report.clone()))?;
     report.cells = changes.cells;
     report.left_out = changes.left_out;
     push.set_report(report.clone());

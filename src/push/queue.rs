@@ -70,7 +70,7 @@ pub enum Begun {
 }
 
 impl PushQueue {
-    /// An empty queue.
+    /// An empty queue with the given limits; its permits are shared by all pushes of the server.
     pub fn new(limits: QueueLimits) -> Self {
         // Rounding up gives the smallest limit one unit at least, so that a push can always run.
         let memory = Arc::new(Semaphore::new(memory_units(limits.memory_bytes) as usize));
@@ -191,9 +191,13 @@ impl PushQueue {
         // More than there is would wait for ever. A push that is capped runs alone, and its reader
         // refuses files that unpack to more.
         let needed = memory_bytes.min(self.limits.memory_bytes);
-        let memory = self.memory.clone().acquire_many_owned(memory_units(needed)).await;
-        // The semaphore is never closed while the process runs.
-        let memory = memory.map_err(|_| PushError::ShuttingDown)?;
+        let memory = self
+            .memory
+            .clone()
+            .acquire_many_owned(memory_units(needed))
+            .await
+            // The semaphore is never closed while the process runs.
+            .map_err(|_| PushError::ShuttingDown)?;
         let parts = PermitParts { memory_bytes: needed, _memory: memory, _twin: twin };
         Ok(PushPermit(Arc::new(parts)))
     }

@@ -189,7 +189,8 @@ impl<'a> Reader<'a> {
         let file = &self.files[index];
         let name = &file.name;
         let before = self.read_bytes;
-        let (push, total) = (self.push, self.total_bytes);
+        let push = self.push;
+        let total = self.total_bytes;
         let progress = &mut |done: u64, _| push.set_progress(before + done, total);
         let refused = |error: IngestError| PushError::Content {
             reason: format!("{name}: {error}"),

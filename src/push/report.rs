@@ -80,6 +80,7 @@ pub struct Ranges {
 impl Ranges {
     /// The ranges of valid Gaussians; none without Gaussians.
     pub fn from_gaussians(gaussians: &Gaussians) -> Option<Self> {
+        // Of no values, the smallest would be infinity.
         if gaussians.is_empty() {
             return None;
         }

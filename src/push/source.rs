@@ -77,6 +77,8 @@ impl SourceAxes {
         let found = |key: &str| {
             let mut found: Vec<&str> =
                 options.iter().filter_map(|option| option.strip_prefix(key)).collect();
+            // Only neighbours are compared, which is enough: with two values anywhere, more than
+            // one stays.
             found.dedup();
             found
         };

@@ -76,7 +76,7 @@ pub struct Status {
     pub error: Option<Arc<PushError>>,
 }
 
-/// One push.
+/// A push from its request to its end, as its threads and the clients that poll it share it.
 pub struct Push {
     request_hash: blake3::Hash,
     /// Counts the pushes of a queue: the oldest is forgotten first.
@@ -96,8 +96,13 @@ impl Push {
             report: None,
             error: None,
         };
-        let status = Mutex::new(status);
-        Self { request_hash, number, status, stop: StopFlag::default(), cancelled: Notify::new() }
+        Self {
+            request_hash,
+            number,
+            status: Mutex::new(status),
+            stop: StopFlag::default(),
+            cancelled: Notify::new(),
+        }
     }
 
     pub(crate) fn request_hash(&self) -> blake3::Hash {

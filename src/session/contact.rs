@@ -297,7 +297,8 @@ impl TwinSolids {
 
 /// Whether an ego has moved so little that it is not tested again.
 fn is_beside(tested: &EgoState, now: &EgoState) -> bool {
-    let [from, to] = [&tested.world_from_rig, &now.world_from_rig];
+    let from = &tested.world_from_rig;
+    let to = &now.world_from_rig;
     from.position_m.distance(to.position_m) < TESTED_M
         && from.rotation.angle_between(to.rotation) < TESTED_RAD
 }

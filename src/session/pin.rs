@@ -24,7 +24,7 @@ pub(crate) async fn pin(
 ) -> Result<PinnedScene, SessionError> {
     let (reply, answer) = oneshot::channel();
     let is_small = resident.blocks() * viewpoints.len() <= limits::DEMAND_IN_PLACE;
-    let request = move || {
+    let start = move || {
         let done = Box::new(move |pinned| {
             // Sending fails if the deadline has passed and the receiver is gone.
             let _ = reply.send(pinned);
@@ -33,7 +33,7 @@ pub(crate) async fn pin(
     };
     // Reads nothing, and takes less time than to wake another thread unless the twin is large.
     // Dropping the request takes the frame out of the pager's queue.
-    let request = if is_small { request()? } else { run_blocking(request).await?? };
+    let request = if is_small { start()? } else { run_blocking(start).await?? };
     match timeout_at(deadline, answer).await {
         Ok(Ok(pinned)) => Ok(pinned?),
         // The pager dropped the request without an answer, which it never does unless it panics.

@@ -113,7 +113,6 @@ impl PinnedVersion {
         Self { solids, ..self }
     }
 
-    /// Sets the references.
     pub(crate) fn with_references(self, references: Option<Arc<ReferenceViews>>) -> Self {
         Self { references, ..self }
     }

@@ -116,6 +116,7 @@ impl Stills {
         // One deadline for all frames together.
         let deadline = Instant::now() + max_wait;
         let mut images = Vec::with_capacity(stills.len());
+        // With memory for one view at a time, each image is a frame of its own.
         for part in stills.chunks(MAX_VIEWS.min(self.reservation.views_at_once())) {
             images.append(&mut self.render_frame(part.to_vec(), actors, deadline).await?);
         }
@@ -146,6 +147,7 @@ impl Stills {
         let work = move |_: &mut _, backend: &dyn wildcity_render::Backend| {
             backend.sweep(&scene, &profile, &view)
         };
+        // A beam counts as a sample of an image does.
         let cost = FrameCost { session: self.slot.number(), samples: beams };
         let (sweep, _queued) = self.engine.run(cost, deadline, work).await?;
         Ok(sweep?)
@@ -216,9 +218,9 @@ fn encoded(index: usize, rgb8: Vec<u8>, still: &Still) -> Result<Vec<u8>, Sessio
         return Ok(rgb8);
     }
     let camera = &still.view.camera;
-    let image = encode(&rgb8, camera.width_px, camera.height_px, still.encoding, false);
-    let image = image.map_err(|reason| SessionError::Encode { camera: index.to_string(), reason });
-    image.map(|image| image.file)
+    encode(&rgb8, camera.width_px, camera.height_px, still.encoding, false)
+        .map(|image| image.file)
+        .map_err(|reason| SessionError::Encode { camera: index.to_string(), reason })
 }
 
 /// Buffers and images that a frame of stills needs in addition to its scene. More than
@@ -238,6 +240,7 @@ fn frame_bytes(engine: &Engine, views: StillViews<'_>, profile: &RenderProfile) 
     let sweep = views.sweep.map(|view| {
         let stages = engine.sweep_bytes(&view.lidar);
         let images = SWEEP_BEAM_BYTES * view.lidar.beams() as u64;
+        // A sweep is never large, so that it may run beside a large frame.
         FrameBytes { stages, beside: stages, is_large: false, images }
     });
     images.chain(sweep).fold(FrameBytes::default(), most)

@@ -108,8 +108,8 @@ impl<'a> Ground<'a> {
         let mut under = None;
         let mut test = |(from, to): (&'a Pose, &'a Pose)| {
             let way_m = to.position_m - from.position_m;
-            let t = (point_m - from.position_m).dot(way_m) / way_m.length_squared().max(1e-12);
-            let t = t.clamp(0.0, 1.0);
+            let along = (point_m - from.position_m).dot(way_m) / way_m.length_squared().max(1e-12);
+            let t = along.clamp(0.0, 1.0);
             let distance_m = (from.position_m + t * way_m).distance(point_m);
             if distance_m < nearest_m {
                 nearest_m = distance_m;

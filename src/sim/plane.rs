@@ -24,8 +24,7 @@ impl Plane {
         let aside_m = position_m - point_m;
         // Vertical move: n · (p - p0) = 0 solved for z. `up.z` is at least 0.7 here.
         position_m.z = point_m.z - (aside_m.x * up.x + aside_m.y * up.y) / up.z;
-        let forward = world_from_rig.rotation * DVec3::X;
-        let forward = forward.reject_from_normalized(up);
+        let forward = (world_from_rig.rotation * DVec3::X).reject_from_normalized(up);
         // A rig that points along the normal has no heading.
         if forward.length() < limits::GROUND_HEADING {
             return None;

@@ -125,7 +125,7 @@ struct SmallImages {
     sees_any: bool,
 }
 
-/// Renders all views.
+/// Renders the small images of all views as one frame, in turn with the frames of sessions.
 async fn render_small(
     engine: &Engine,
     scene: Scene,

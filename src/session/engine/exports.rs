@@ -102,9 +102,8 @@ impl Shared {
     fn run(&self, records: &Receiver<PathBuf>) {
         for record in records {
             // A panic must not end the thread: all later records would wait forever.
-            let exported = catch_unwind(AssertUnwindSafe(|| export(&record)));
-            let exported =
-                exported.unwrap_or_else(|_| Err(Failure::Bad("the export crashed".to_owned())));
+            let exported = catch_unwind(AssertUnwindSafe(|| export(&record)))
+                .unwrap_or_else(|_| Err(Failure::Bad("the export crashed".to_owned())));
             let mut state = self.state.lock();
             let name = state.waiting.pop_front().unwrap_or_default();
             if let Err(reason) = exported {

@@ -31,6 +31,7 @@ impl LatestVersions {
             is_old = true;
             Look { begun: now, is_over: false, number: None }
         });
+        // A look that is under way is not repeated, however long it takes.
         if look.is_over && now.saturating_duration_since(look.begun) >= age {
             is_old = true;
             look.begun = now;
@@ -43,6 +44,7 @@ impl LatestVersions {
     fn found(&self, twin: &str, number: Option<u64>) {
         if let Some(look) = self.0.lock().get_mut(twin) {
             look.is_over = true;
+            // A look that failed leaves the number that is known.
             look.number = number.or(look.number);
         }
     }
@@ -55,6 +57,8 @@ impl Engine {
         if let Some(pinned) = self.pinned_latest(twin) {
             return Some(pinned);
         }
+        // A look at an object store is a request over the network, so its result is used for
+        // longer.
         let is_remote = self.cache.catalog().traffic().is_some();
         let age = if is_remote { limits::REMOTE_LATEST_AGE } else { limits::LATEST_AGE };
         let (number, is_old) = self.latest.ask(twin, Instant::now(), age);

@@ -158,6 +158,7 @@ impl Engine {
         work: u64,
         deadline: Instant,
     ) -> Result<Option<Turn>, SessionError> {
+        // Waiting for a turn would delay short work behind long work.
         if work <= limits::SHORT_WORK {
             return Ok(None);
         }
@@ -433,6 +434,8 @@ impl Engine {
         let is_small = |views: &&[View]| sample_count(views, profile) <= limits::LARGE_SAMPLES;
         let alone =
             || views.iter().map(std::slice::from_ref).filter(is_small).map(side_bytes).max();
+        // Of a large frame whose cameras are all large, nothing is ever rendered beside another
+        // frame.
         let beside = if is_large { alone().unwrap_or(0) } else { side_bytes(views) };
         let stages = backend.frame_bytes(views, profile) + rendered;
         FrameBytes { stages, beside, is_large, images }

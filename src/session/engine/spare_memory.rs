@@ -85,7 +85,8 @@ mod tests {
     fn two_at_once_do_not_share_it() {
         let spare = SpareMemory::default();
         spare.recycle(vec![9; 1000]);
-        let [first, second] = [spare.take(1000), spare.take(1000)];
+        let first = spare.take(1000);
+        let second = spare.take(1000);
         assert_eq!([&first[..], &second], [[9; 1000], [0; 1000]]);
         // The larger of two returned blocks is kept.
         let spare = SpareMemory::default();

@@ -44,7 +44,6 @@ pub struct DamagedSummary {
 pub struct TrajectorySummary {
     /// Name of the trajectory.
     pub name: String,
-    /// Length, in metres.
     pub length_m: f64,
     pub keyframes: u64,
 }

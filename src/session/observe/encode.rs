@@ -125,11 +125,13 @@ pub(crate) fn encode(
 ) -> Result<EncodedImage, String> {
     let started = Instant::now();
     let file = || match encoding {
+        // Raw pixels are in the answer already.
         ImageEncoding::Raw => Ok(Vec::new()),
         ImageEncoding::Jpeg(quality) if in_parallel => jpeg_in_strips(rgb8, width, height, quality),
         ImageEncoding::Jpeg(quality) => jpeg(rgb8, width, height, quality),
         ImageEncoding::Png => png(rgb8, width, height),
     };
+    // Both read all pixels, and neither needs the other.
     let (hash, file) = if in_parallel {
         rayon::join(|| blake3::hash(rgb8), file)
     } else {

@@ -48,6 +48,7 @@ impl FrameHistory {
         budget: &AnswerBudget,
         frame: PastFrame,
     ) -> Result<(), SessionError> {
+        // Before the frame is added, so that a refusal leaves the history as it was.
         let share = budget.reserve(frame.bytes.len() as u64)?;
         self.0.push(Arc::new(KeptFrame { frame, _share: share }));
         Ok(())

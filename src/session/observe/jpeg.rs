@@ -75,9 +75,9 @@ const NO_SCAN: &str = "the encoder's file has no scan";
 /// Where the segments of a file start.
 #[derive(Clone, Copy, Debug)]
 struct Head {
-    /// The frame header.
+    /// The frame header, which has the size in pixels: the marker `SOF0`.
     frame: usize,
-    /// The scan header.
+    /// The scan header, which lists the colour channels: the marker `SOS`.
     scan: usize,
     /// The entropy-coded data, which end with the file's last marker.
     data: usize,
@@ -167,8 +167,9 @@ mod tests {
             let rgb8 = picture(width, height);
             let file = jpeg(&rgb8, width, height, 90).unwrap();
             assert_eq!(file, jpeg(&rgb8, width, height, 90).unwrap());
-            let read = image::load_from_memory_with_format(&file, image::ImageFormat::Jpeg);
-            let read = read.unwrap().to_rgb8();
+            let read = image::load_from_memory_with_format(&file, image::ImageFormat::Jpeg)
+                .unwrap()
+                .to_rgb8();
             assert_eq!(read.dimensions(), (width, height));
             let squares =
                 read.as_raw().iter().zip(&rgb8).map(|(a, b)| f64::from(a.abs_diff(*b)).powi(2));

@@ -285,11 +285,11 @@ impl ObservationLayout {
     /// State of the sensors of an episode at its start; `None` without effects.
     pub(crate) fn episode_sensors(&self) -> Option<EpisodeSensors> {
         let SensorLayout { settings, cameras } = self.sensors.as_ref()?;
-        let reach_us = |(camera, sensor): (usize, &CameraSensor)| {
+        let camera_reach_us = |(camera, sensor): (usize, &CameraSensor)| {
             settings::reach_us(sensor, self.schedule.period_us(camera))
         };
         // The track of poses has to reach back as far as the slowest camera.
-        let reach_us = cameras.iter().enumerate().map(reach_us).max().unwrap_or(0);
+        let reach_us = cameras.iter().enumerate().map(camera_reach_us).max().unwrap_or(0);
         Some(EpisodeSensors::at_start(settings, reach_us))
     }
 
@@ -439,14 +439,14 @@ impl ObservationLayout {
             (instances, limits::INSTANCE_BYTES),
             (semantics, limits::SEMANTICS_BYTES),
         ];
-        let maps = maps.iter().map(|&(held, bytes)| if held { bytes } else { 0 }).sum::<u64>();
+        let map_bytes = maps.iter().map(|&(held, bytes)| if held { bytes } else { 0 }).sum::<u64>();
         let colour = match self.encoding {
             // The PNG of an image full of noise is as large as its pixels.
             ImageEncoding::Raw | ImageEncoding::Png => 3,
             ImageEncoding::Jpeg(_) => limits::JPEG_PIXEL_BYTES,
         };
         let beams: usize = self.lidars.iter().map(|mounted| mounted.lidar.beams()).sum();
-        2 * (self.rig_pixels() * (maps + colour) + limits::POINT_BYTES * beams as u64)
+        2 * (self.rig_pixels() * (map_bytes + colour) + limits::POINT_BYTES * beams as u64)
     }
 
     /// Bytes of the images outside of the answer while a frame is rendered: pixels that are
@@ -455,6 +455,8 @@ impl ObservationLayout {
         let PixelMaps { depth, opacity, normals, .. } = self.maps;
         // Raw pixels are rendered into the answer itself.
         let pixels = if self.encoding == ImageEncoding::Raw { 0 } else { 3 };
+        // Trust is computed from opacity, and normals from depth: both are rendered even if the
+        // answer has neither.
         let opacity = if has_trust && !opacity { 4 } else { 0 };
         let depth = if normals && !depth { 4 } else { 0 };
         self.rig_pixels() * (pixels + opacity + depth)
@@ -469,6 +471,7 @@ impl ObservationLayout {
         let with_normals =
             if self.maps.normals { limits::ANSWER_PIXELS / 2 } else { limits::ANSWER_PIXELS };
         let has_owners = self.maps.instances || self.maps.semantics;
+        // With instances or classes a pixel takes 4/3 of the bytes.
         if has_owners { with_normals / 4 * 3 } else { with_normals }
     }
 
@@ -519,6 +522,7 @@ impl ObservationLayout {
 
     /// Whether a later observation shows a camera's image of a capture.
     pub(crate) fn is_shown_later(&self, capture: &RigCapture, camera: usize) -> bool {
+        // A picture that is not shown now was rendered for a later observation.
         !capture.shown || self.schedule.is_shown_after(camera, capture.due_us, capture.due_us)
     }
 

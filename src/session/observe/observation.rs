@@ -8,7 +8,7 @@ use super::trust::Trust;
 use crate::repair::status::ImageRepair;
 use crate::sensors::ImageSensor;
 
-/// A finished observation.
+/// An observation with all of its tensors, which only lacks the header of an answer.
 #[derive(Debug)]
 pub struct Observation {
     /// The bytes of all tensors, behind the bytes reserved for the header.

@@ -54,6 +54,7 @@ impl PointCloud {
             columns: Vec::new(),
             instances: Vec::new(),
             classes: Vec::new(),
+            // Replaced below, once the points are known.
             hash: Hasher::new().finalize(),
         };
         // A stream of its own for each sweep: a lost beam changes no other sweep.
@@ -61,6 +62,7 @@ impl PointCloud {
             Random::new(seed.seed, &format!("lidar.{}", mounted.name), time_us as usize)
         });
         for (at, &range_m) in sweep.range_m.iter().enumerate() {
+            // The renderer gives a beam that hits nothing a range of 0.
             let has_return = range_m > 0.0;
             let mut range_m = f64::from(range_m);
             if let (Some((sensor, _)), Some(random)) = (effects, &mut random) {
@@ -79,6 +81,7 @@ impl PointCloud {
             if !has_return {
                 continue;
             }
+            // Beams are stored row by row.
             let row = at / beams.columns();
             let column = at % beams.columns();
             let in_lidar_m = range_m * beams.direction(row, column);

@@ -126,6 +126,7 @@ impl Schedule {
     /// Whether the first decision at `time_us` or after it shows the frame of a camera that was
     /// taken at `taken_us`. If it does not, no later one does.
     pub(crate) fn is_shown_from(&self, camera: usize, taken_us: i64, time_us: i64) -> bool {
+        // Times are whole microseconds: from a time on is after the microsecond before it.
         self.is_shown_after(camera, taken_us, time_us - 1)
     }
 

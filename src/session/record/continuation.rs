@@ -46,7 +46,7 @@ pub(crate) struct KeptFrames {
     pub(crate) frames: Vec<KeptFrame>,
 }
 
-/// One frame.
+/// A frame of one camera in that answer.
 pub(crate) struct KeptFrame {
     /// Index of the camera.
     pub(crate) camera: usize,
@@ -174,7 +174,8 @@ impl Continuation {
             episode.leave_model();
         }
         // A plan of several steps may pass over the one that was asked for.
-        let (reached, step) = (episode.step(), self.origin.step);
+        let reached = episode.step();
+        let step = self.origin.step;
         if reached != step {
             let reason = format!("its steps lead to step {reached} and not to {step}");
             return Err(BranchError::Diverged(reason).into());

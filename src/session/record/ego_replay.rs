@@ -14,9 +14,9 @@ pub struct DivergedStep {
     /// Line of the episode's file, from 1.
     pub line: usize,
     pub step: u64,
-    /// `world_from_rig` as recorded.
+    /// `world_from_rig` in the record.
     pub recorded: Pose,
-    /// `world_from_rig` now.
+    /// `world_from_rig` that the same command leads to now.
     pub now: Pose,
 }
 

@@ -273,6 +273,7 @@ impl FrameRecord {
     /// When the frames at a pose were taken, in microseconds; those of a warm-up are at any time
     /// below 0.
     pub fn taken_us(&self, pose: usize) -> i64 {
+        // All poses of `observe` are of one time. Of other requests only the last pose is of now.
         let is_now = self.request == FrameRequest::Observe || pose + 1 == self.poses.len();
         // All times of the warm-up are below 0, and which one it is does not matter.
         let otherwise = if is_now { self.time_us } else { -1 };
@@ -281,6 +282,7 @@ impl FrameRecord {
 
     /// When the frames at a pose were due, in microseconds.
     pub(crate) fn due_us(&self, pose: usize) -> i64 {
+        // Without a delay in a sensor, a frame is taken when it is due.
         self.due_us.get(pose).copied().unwrap_or_else(|| self.taken_us(pose))
     }
 

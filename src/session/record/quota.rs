@@ -68,6 +68,7 @@ impl RecordQuota {
         }
         let mut held = self.held.lock();
         let is_old = held.looked.is_none_or(|looked| looked.elapsed() >= LOOK_PERIOD);
+        // The first look is made in any case, so that records of earlier runs count.
         if held.looked.is_none() || (is_old && refusal(&held, limits, owner, bytes).is_some()) {
             *held = Held::look(&self.dir)?;
         }
@@ -82,6 +83,7 @@ impl RecordQuota {
     /// Gives back bytes that were not written.
     pub(crate) fn give_back(&self, owner: &str, bytes: u64) {
         let mut held = self.held.lock();
+        // Saturating, because a look at the disk in between may not have counted them.
         held.bytes = held.bytes.saturating_sub(bytes);
         if let Some(own) = held.by_owner.get_mut(owner) {
             *own = own.saturating_sub(bytes);
@@ -117,6 +119,7 @@ impl Held {
         let mut held = Self { looked: Some(Instant::now()), ..Self::default() };
         let entries = match std::fs::read_dir(dir) {
             Ok(entries) => entries,
+            // Without the directory there are no records.
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(held),
             Err(error) => return Err(error),
         };

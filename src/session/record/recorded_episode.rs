@@ -17,7 +17,7 @@ use crate::limits::PLAN_STEPS;
 const _: () =
     assert!(4 * Overlay::MAX_PIXELS * 4 / 3 * 1001 / 1000 + (1 << 20) <= HEAD_BYTES as u64);
 
-/// A recorded episode.
+/// The lines of an episode's file, grouped by their kinds.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RecordedEpisode {
     /// Inputs and settings of its rendering.

@@ -70,7 +70,6 @@ impl Recorder {
         Ok(NewFile { recorder, number })
     }
 
-    /// The file.
     pub(crate) fn path(&self) -> &Path {
         &self.path
     }

@@ -121,8 +121,10 @@ impl<'a> RepairReplay<'a> {
         let needs = |model: &Arc<Model>| NeededReferences::from_model(model).any();
         if self.model.as_ref().is_some_and(needs) {
             let version = resident.version.clone();
-            let table = self.catalog.views(&version);
-            let table = table.map_err(|cause| ReplayError::Reference(cause.to_string()))?;
+            let table = self
+                .catalog
+                .views(&version)
+                .map_err(|cause| ReplayError::Reference(cause.to_string()))?;
             self.references = ReferenceViews::new(version, table, cameras);
         }
         Ok(())

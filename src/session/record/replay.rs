@@ -71,6 +71,8 @@ impl RecordedEpisode {
         let mut replay = Replay::new(self, open(self.header.version)?, actors, backend, repairs)?;
         let mut switches = self.versions.iter().peekable();
         for (index, frame) in self.frames.iter().enumerate() {
+            // Several switches may come before one frame. Each is made, because its changes are
+            // reported.
             while let Some((_, to)) = switches.next_if(|(frames_before, _)| *frames_before <= index)
             {
                 replay.switch_version(open(to.version)?, to)?;
@@ -95,6 +97,7 @@ impl RecordedEpisode {
                 episode.leave_model();
             }
             let wrong = values::wrong_in_end(end, &episode, self.end_line);
+            // The first wrong value stays, because it may be the cause of the others.
             replay.report.wrong_value = replay.report.wrong_value.or(wrong);
         }
         Ok(replay.report)
@@ -352,6 +355,7 @@ impl<'a> Replay<'a> {
         let is_decision = schedule.is_none_or(|schedule| schedule.is_decision(frame.time_us));
         let is_shown = frame.request != FrameRequest::Observe && is_decision;
         let expected = if is_shown { self.lidars.len() } else { 0 };
+        // `zip` below compares only as many sweeps as both have.
         if frame.sweeps.len() != expected && self.report.wrong_value.is_none() {
             self.report.wrong_value = Some(WrongValue {
                 line: self.frame_lines[index],

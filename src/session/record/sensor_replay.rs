@@ -31,9 +31,10 @@ impl SensorReplay {
         schedule.check(cameras.len(), header.dt_us).map_err(wrong)?;
         // No maps: only the times and the effects of the layout are used here.
         let maps = PixelMaps::default();
-        let layout =
-            ObservationLayout::new(cameras, header.outputs.encoding, maps, schedule.clone());
-        let mut layout = layout.map_err(wrong)?.with_lidars(header.rig.lidars.clone());
+        let mut layout =
+            ObservationLayout::new(cameras, header.outputs.encoding, maps, schedule.clone())
+                .map_err(wrong)?
+                .with_lidars(header.rig.lidars.clone());
         layout.add_sensors(sensors.clone(), header.dt_us).map_err(wrong)?;
         let effect_seed = EffectSeed::from_episode(&header.first_state());
         Ok(Some(Self { layout, effect_seed }))

@@ -35,7 +35,6 @@ pub(crate) struct ReferenceInputs {
     pub(crate) warped: Option<(Image, Vec<f32>)>,
     /// For the role `reference`, in the size of the image.
     pub(crate) reference: Option<Image>,
-    /// Name of [`Self::reference`].
     pub(crate) nearest: Option<String>,
     /// The names of the references that contributed pixels, ordered from most to fewest pixels.
     pub(crate) names: Vec<String>,
@@ -178,7 +177,8 @@ fn decoded(
         path: format!("recorded image {name} ({})", object.object).into(),
         reason,
     };
-    let [width, height] = [camera.width_px, camera.height_px];
+    let width = camera.width_px;
+    let height = camera.height_px;
     let mut reader = ImageReader::new(std::io::Cursor::new(bytes));
     // Before decoding: the header of a damaged file may claim any size.
     let mut limits = Limits::default();
@@ -189,7 +189,8 @@ fn decoded(
     let image = reader.decode().map_err(|error| damaged(error.to_string()))?;
     // The limits refuse larger images only.
     if [image.width(), image.height()] != [width, height] {
-        let [w, h] = [image.width(), image.height()];
+        let w = image.width();
+        let h = image.height();
         return Err(damaged(format!("it has {w} x {h} px; its camera has {width} x {height}")));
     }
     Ok(image)

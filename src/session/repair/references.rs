@@ -125,6 +125,7 @@ impl ReferenceView {
 
     /// Returns this image with the exposure of a camera, if its own exposure is known.
     pub(crate) fn exposed_for(mut self, camera: &RigCamera) -> Self {
+        // From an unknown exposure the picture cannot be brought to another one.
         if self.recorded.as_ref().is_some_and(|view| view.exposure_stops.is_some()) {
             self.appearance.exposure = camera.appearance.exposure;
         }
@@ -196,8 +197,8 @@ impl ReferenceViews {
             let of = trajectories.iter().position(|drive| drive.name == view.trajectory);
             // Images along a drive that the version does not have cannot be placed.
             let Some(drive) = of.and_then(|index| drives.get_mut(index)) else { continue };
-            let at = drive.cameras.iter().position(|(name, _)| *name == view.camera_name);
-            let at = at.unwrap_or_else(|| {
+            let known = drive.cameras.iter().position(|(name, _)| *name == view.camera_name);
+            let at = known.unwrap_or_else(|| {
                 drive.cameras.push((view.camera_name.clone(), Vec::new()));
                 drive.cameras.len() - 1
             });
@@ -270,8 +271,10 @@ impl ReferenceViews {
             self.camera_views(&place, &camera.name).into_iter().filter(fits).collect();
         let nearest = all.iter().min_by(|a, b| distance_m(a).total_cmp(&distance_m(b)))?;
         // The image of before is only kept while it fits.
-        let kept = all.iter().find(|view| Some(&*view.name) == kept);
-        let kept = kept.filter(|kept| distance_m(kept) - distance_m(nearest) < SWITCH_HYSTERESIS_M);
+        let kept = all
+            .iter()
+            .find(|view| Some(&*view.name) == kept)
+            .filter(|kept| distance_m(kept) - distance_m(nearest) < SWITCH_HYSTERESIS_M);
         Some(kept.unwrap_or(nearest).clone().exposed_for(camera))
     }
 
@@ -287,6 +290,7 @@ impl ReferenceViews {
         // only takes memory.
         let projection = Arc::new(Projection::from_camera(camera));
         let mut all = self.projections.lock();
+        // Beyond the limit a table is used once and not kept, so that the memory is bounded.
         if all.len() < PROJECTIONS {
             all.push((*camera, projection.clone()));
         }
@@ -331,6 +335,7 @@ impl ReferenceViews {
                 of.flat_map(|(_, views)| views).map(recorded).collect()
             }
             ReferenceSource::Rendered => {
+                // 15 steps in either direction.
                 let around = (REFERENCE_WITHIN_M / STEP_M) as usize;
                 let middle = self.step(place.drive, place.station_m);
                 let of: Vec<&RigCamera> =

@@ -112,6 +112,7 @@ impl ActorAssets {
         poses_before: &dyn Fn(i64) -> Vec<Option<Pose>>,
         frame: FrameDetail<'_>,
     ) -> Vec<PlacedChunk> {
+        // By exposure, because most views have the same one.
         let at_start: BTreeMap<i64, Vec<Option<Pose>>> =
             frame.exposures_us.iter().map(|&us| (us, poses_before(us))).collect();
         let actors = self.0.iter().zip(poses).enumerate();

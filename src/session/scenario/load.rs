@@ -25,7 +25,7 @@ pub struct Scenarios {
     is_inline: bool,
 }
 
-/// Which scenario.
+/// Where the document of a scenario comes from.
 #[derive(Clone, Debug, PartialEq)]
 pub enum ScenarioSource {
     /// A file of the server's directory, by its name without `.json`.
@@ -320,6 +320,7 @@ impl Scenarios {
     ) -> Result<ScenarioFile, ScenarioError> {
         let document = self.document(source)?;
         let mut chosen = document.first_values();
+        // Given values replace the first ones of the same names.
         let given = values.iter().map(|(name, value)| (name.clone(), Arc::new(value.clone())));
         chosen.extend(given);
         document
@@ -332,6 +333,7 @@ impl Scenarios {
         if !self.is_inline {
             return error;
         }
+        // The field is `map.file` or `tracks.file`.
         let kind = field.trim_end_matches(".file");
         let reason = format!("there is no {kind} of this name that fits the scenario");
         ScenarioError::Read { field, file: file.to_owned(), reason }

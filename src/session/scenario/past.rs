@@ -46,7 +46,8 @@ impl ActorPast {
         // Here from < time < to.
         let t = (time_us - from_us) as f64 / (to_us - from_us) as f64;
         let between = from.iter().zip(to.iter()).map(|(from, to)| {
-            let (from, to) = (pose(from)?, pose(to)?);
+            let from = pose(from)?;
+            let to = pose(to)?;
             // An actor that stands stays exactly where it is.
             Some(if from == to { to } else { from.interpolate(&to, t) })
         });

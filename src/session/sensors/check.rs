@@ -127,7 +127,8 @@ fn whole(
     if accepted_us.contains(&value_us) && value_us % of_us == 0 {
         return Ok(());
     }
-    let (least_us, most_us) = (accepted_us.start(), accepted_us.end());
+    let least_us = accepted_us.start();
+    let most_us = accepted_us.end();
     let must = match of_us {
         1 => format!("{value_us} µs; {least_us} to {most_us} µs are accepted"),
         _ => format!(

@@ -47,10 +47,10 @@ impl MotionSample {
     pub(crate) fn new(from: &Ego, to: &Ego, dt_us: i64, time_us: i64) -> Self {
         let rig_from_world = to.world_from_rig().rotation.inverse();
         // Products of unit quaternions are only nearly of unit length.
-        let turned =
+        let turn =
             (from.world_from_rig().rotation.inverse() * to.world_from_rig().rotation).normalize();
         // The shorter of the two ways to turn.
-        let turned = if turned.w < 0.0 { -turned } else { turned };
+        let turned = if turn.w < 0.0 { -turn } else { turn };
         Self {
             time_us,
             specific_force: rig_from_world * (to.acceleration_m_s2() + GRAVITY_M_S2 * DVec3::Z),
@@ -71,8 +71,8 @@ impl MotionSample {
                 _ => self.angular_velocity[index - 3],
             };
             // Each name is a stream of its own. Two axes of one name would drift alike.
-            let name = ["x", "y", "z", "r", "p", "yaw"][index];
-            let name = format!("imu/bias/{name}");
+            let suffix = ["x", "y", "z", "r", "p", "yaw"][index];
+            let name = format!("imu/bias/{suffix}");
             let drifted = drift(seed, &name, bias_period_us(imu), self.time_us);
             (ideal + noise * standard_normal(&mut random) + bias * drifted) as f32
         };

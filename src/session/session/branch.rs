@@ -36,7 +36,6 @@ impl Session {
         self.snapshots.store(name, self.present())
     }
 
-    /// The present state.
     fn present(&self) -> Snapshot {
         let step = self.state.episode.step();
         // Without a file, no frame of this episode is on record: a branch has the origin that the
@@ -119,8 +118,14 @@ impl Session {
         let scenes =
             Engine::scene_bytes(resident, extent, version.profile, settings.may_split()).await?;
         let reservation = version.resident.reserve_scenes(scenes, frame)?;
-        let (settings, version, state) = (settings.clone(), version.clone(), state.clone());
-        let mut session = Self::assembled(engine, name, settings, reservation, version, state);
+        let mut session = Self::assembled(
+            engine,
+            name,
+            settings.clone(),
+            reservation,
+            version.clone(),
+            state.clone(),
+        );
         session.origin.clone_from(origin);
         session.take_snapshot(FIRST_SNAPSHOT.to_owned())?;
         Ok(session)

@@ -78,7 +78,7 @@ pub struct Session {
 }
 
 impl Session {
-    /// Its name.
+    /// The name of the session, with which the names of its episodes begin.
     pub fn name(&self) -> &str {
         &self.name
     }
@@ -241,7 +241,7 @@ impl Session {
         self.recorder.as_ref().map(|_| format!("{}-{}", self.name, self.episode_number))
     }
 
-    /// The current episode.
+    /// The current episode, as the last request left it.
     pub fn episode(&self) -> &Episode {
         &self.state.episode
     }

@@ -108,8 +108,8 @@ impl Session {
             asked.seed,
             opened.as_ref().and_then(|opened| opened.episode.loaded.lanes()),
         )?;
-        let drive = drive_to_follow(&manifest.trajectories, ego.start.as_ref());
-        let drive = drive.map(|drive| Arc::new(RecordedDrive::new(drive)));
+        let drive = drive_to_follow(&manifest.trajectories, ego.start.as_ref())
+            .map(|drive| Arc::new(RecordedDrive::new(drive)));
 
         // The same seed as for the start, as in every later episode.
         let episode = start
@@ -256,6 +256,7 @@ impl Session {
         if !self.settings.follows_latest {
             return;
         }
+        // A version that could not be followed is not tried again at each step.
         let newer = self.newer_version().filter(|newer| self.not_followed != Some(*newer));
         let Some(newer) = newer else { return };
         if let Err(error) = self.switch_version(Some(newer)).await {
@@ -275,6 +276,7 @@ impl Session {
     pub async fn switch_version(&mut self, version: Option<u64>) -> Result<(), SessionError> {
         let current = &self.resident().version;
         let resident = self.engine.open_version(current.manifest.twin.clone(), version).await?;
+        // A switch to the version itself would be an entry in the record without a change.
         if resident.version.number == current.number {
             return Ok(());
         }
@@ -351,9 +353,11 @@ async fn decoded(
     let bytes = unread.decoding_bytes();
     // Before the turn, so that requests that wait hold no more than their messages and this budget.
     let reserved = engine.answer_budget().reserve(bytes)?;
+    // A rig without overlays has nothing to decode, and need not wait.
     let turn = if bytes == 0 { None } else { Some(engine.overlay_turn().await?) };
     let decode = move || {
         let rig = unread.decode();
+        // Held until the decoding ends, which a caller that no longer waits does not stop.
         drop((turn, reserved));
         rig
     };
@@ -375,8 +379,11 @@ impl Asked {
         if let Some(Start::Pose { pose }) = &options.start {
             checked_pose(*pose)?;
         }
-        let dynamics = options.dynamics.map(wildcity_options::Dynamics::from);
-        let dynamics = dynamics.map(Dynamics::try_from).transpose()?;
+        let dynamics = options
+            .dynamics
+            .map(wildcity_options::Dynamics::from)
+            .map(Dynamics::try_from)
+            .transpose()?;
         // How long a step takes in simulated time, and an answer in real time.
         let dt_us = check_dt(options.dt_us)?;
         let deadline =
@@ -551,7 +558,8 @@ pub(super) async fn prepare(
 ) -> Result<PinnedVersion, SessionError> {
     Engine::bake_sky(resident.clone(), profile).await?;
     let index = {
-        let (engine, resident) = (engine.clone(), resident.clone());
+        let engine = engine.clone();
+        let resident = resident.clone();
         run_blocking(move || engine.spatial_index(&resident)).await?
     };
     let solids = solid_ego.map(|ego_box| engine.solids(index.clone(), ego_box));

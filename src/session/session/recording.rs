@@ -259,8 +259,9 @@ fn traffic_lines(traffic: &EpisodeTraffic, frame: &FrameRecord, is_first: bool) 
     let count = traffic.last_steps(if is_first { usize::MAX } else { steps as usize }).count();
     // The last of the states is that of `step`.
     let before = (step + 1).saturating_sub(count as u64);
-    let of_steps = (before..).zip(traffic.last_steps(count));
-    let of_steps = of_steps.map(|(step, (time_us, states))| ActorsLine::new(step, time_us, states));
+    let of_steps = (before..)
+        .zip(traffic.last_steps(count))
+        .map(|(step, (time_us, states))| ActorsLine::new(step, time_us, states));
     let actors = warm_up.chain(of_steps).map(Line::Actors);
     let events = traffic.events().iter().map(|event| event_line(step, event));
     actors.chain(events).collect()

@@ -51,8 +51,9 @@ impl Session {
         // One after the other: like its frames, each has its turn among those of other sessions.
         for view in wanted {
             let id = view.id();
-            let reference = self.reference(version, views, view, deadline);
-            let reference = reference.instrument(debug_span!("reference", id));
+            let reference = self
+                .reference(version, views, view, deadline)
+                .instrument(debug_span!("reference", id));
             references.insert(id, reference.await?);
         }
         builder.add_references(references, started.elapsed());
@@ -82,9 +83,9 @@ impl Session {
                 Ok::<_, SessionError>((image, views.projection(&view.camera)))
             }
         };
-        let read = timeout_at(deadline, run_blocking(read)).await;
+        let in_time = timeout_at(deadline, run_blocking(read)).await;
         // Too late, a panic, and an error of the store.
-        let (image, projection) = read.map_err(|_| SessionError::DeadlineExceeded)???;
+        let (image, projection) = in_time.map_err(|_| SessionError::DeadlineExceeded)???;
         let profile = version.profile;
         let places = viewpoints(&[view.view()]);
         // Pinned until it is drawn, as the scene of any frame is.

@@ -110,6 +110,7 @@ impl Session {
     ) -> Result<Observation, SessionError> {
         let steps = self.plan_steps(&command, options.until_us)?;
         check_notes(options.notes.as_ref())?;
+        // Before the deadline begins: to open a newer version is no part of the step.
         self.follow_latest().await;
         let deadline = Instant::now() + self.settings.deadline;
         let now = &self.state.episode;
@@ -139,7 +140,7 @@ impl Session {
         let rendered =
             self.render(&self.version, simulation, captures, Some(frame_history), deadline).await?;
         // An ego that failed first has not left the area by what came after.
-        let failed_us = next.is_failed().then(|| match &traffic {
+        let failure_us = next.is_failed().then(|| match &traffic {
             // Only the end tells which of the contacts the scenario judges.
             Some(traffic) => {
                 let is_end = |event: &&Event| matches!(event.kind, EventKind::End(_));
@@ -148,8 +149,7 @@ impl Session {
             // Without a scenario, any contact fails, and the first one did.
             None => events.iter().map(|event| event.time_us).min(),
         });
-        let failed_us = failed_us.flatten();
-        let left = left_model(&mut next, met.off_model, &rendered, failed_us);
+        let left = left_model(&mut next, met.off_model, &rendered, failure_us.flatten());
         if let Some(event) = left {
             add_event(traffic.as_mut(), &mut events, event);
         }
@@ -200,6 +200,7 @@ impl Session {
             let drives = &index.version().manifest.trajectories;
             let ground = Ground::from_drives(drives).with_boxes(index.boxes()).and_lanes(lanes);
             let (episode, egos) = now.followed(&command, steps, &ground, terminate)?;
+            // Each part may take long, so that a stop is looked for between them.
             stop.refusal()?;
             let met = meetings(&now, &egos, solids.as_ref(), &index, dt_us, stop)?;
             stop.refusal()?;
@@ -424,8 +425,8 @@ impl Session {
                 if let Some(references) = &version.references {
                     builder = self.find_references(version, references, builder, deadline).await?;
                 }
-                let repaired = run_blocking(move || builder.repair().map(|()| builder));
-                let repaired = repaired.instrument(debug_span!("repair"));
+                let repaired = run_blocking(move || builder.repair().map(|()| builder))
+                    .instrument(debug_span!("repair"));
                 // A model that hangs ends with its own timeout; the session does not wait for it
                 // longer than for a frame.
                 let in_time = timeout_at(deadline, repaired).await;
@@ -466,8 +467,8 @@ impl Session {
         });
         // Load before the job is queued, so that no render thread waits for a disk.
         let resident = version.resident.clone();
-        let pinned = pin(resident, profile, deadline, viewpoints);
-        let mut pinned = pinned.instrument(debug_span!("load")).await?;
+        let mut pinned =
+            pin(resident, profile, deadline, viewpoints).instrument(debug_span!("load")).await?;
         pinned.place(placed.unwrap_or_default());
         builder.add_load(pinned.waited_for, pinned.waited);
         let cost = FrameCost::new(self.slot.number(), &views, &profile);
@@ -500,6 +501,7 @@ fn meetings(
     };
     // An ego that has left the area once is not looked for again.
     let recorded = index.recorded().filter(|_| !now.is_off_model());
+    // Lazy, so that the search ends at the first pose that is off.
     let mut trusts = egos.iter().zip(1..).filter_map(|(ego, step)| {
         Some((begin_us + step * dt_us, recorded?.trust(&ego.world_from_rig())))
     });

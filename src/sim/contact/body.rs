@@ -22,9 +22,9 @@ impl Body {
     /// ahead of the pose's origin: 0 for an actor. The box stands upright: the tilt of a pose on a
     /// slope moves its centre but leaves its outline as it is.
     pub fn new(world_from_body: &Pose, size: &ActorBox, center_x_m: f64) -> Self {
-        let forward = world_from_body.rotation * DVec3::X;
         // A pose that looks straight up has no heading; any does then.
-        let forward = forward.truncate().try_normalize().unwrap_or(DVec2::X);
+        let forward =
+            (world_from_body.rotation * DVec3::X).truncate().try_normalize().unwrap_or(DVec2::X);
         let center = world_from_body.transform_point(DVec3::new(center_x_m, 0.0, 0.0));
         let footprint = Footprint {
             center_m: center.truncate(),

@@ -101,7 +101,8 @@ fn exponential(matrix: DMat2) -> DMat2 {
     } else {
         // `cosh` alone would overflow for a large ν, although `e^μ cosh ν` is small. So the
         // exponents are added first.
-        let (slow, fast) = ((mean + root).exp(), (mean - root).exp());
+        let slow = (mean + root).exp();
+        let fast = (mean - root).exp();
         (0.5 * (slow + fast), 0.5 * (slow - fast) / root)
     };
     DMat2::from_diagonal(DVec2::splat(even)) + rest * odd
@@ -116,7 +117,8 @@ mod tests {
         // Scaling and squaring: divided by 2^12 the series converges in twelve terms, and twelve
         // squarings undo the scaling.
         let scaled = matrix * 2f64.powi(-12);
-        let (mut sum, mut term) = (DMat2::IDENTITY, DMat2::IDENTITY);
+        let mut sum = DMat2::IDENTITY;
+        let mut term = DMat2::IDENTITY;
         for k in 1..12 {
             term = term * scaled * (1.0 / f64::from(k));
             sum += term;
@@ -140,7 +142,8 @@ mod tests {
 
     #[test]
     fn at_a_crawl_the_car_rolls_as_it_is_steered() {
-        let (car, tyres) = (Vehicle::DEFAULT, Vehicle::DEFAULT.tyres());
+        let car = Vehicle::DEFAULT;
+        let tyres = Vehicle::DEFAULT.tyres();
         let steering = Steering { angle_rad: 0.3, target_rad: 0.3, lag_s: 0.1 };
         // The square of 1e-300 underflows to 0. The sideways state at the start must fade in all of
         // them.

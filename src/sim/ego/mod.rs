@@ -312,12 +312,12 @@ impl Ego {
             // The remaining pairs are refusals: the models that move by actions have no use for a
             // pose, and a teleport none for an action.
             (model, Command::Action(_)) => {
-                let (given, takes) = ("action", "pose or trajectory");
-                Err(EgoError::Command { model: model.name(), given, takes })
+                let takes = "pose or trajectory";
+                Err(EgoError::Command { model: model.name(), given: "action", takes })
             }
             (model, Command::Pose(_)) => {
-                let (given, takes) = ("pose", "action or trajectory");
-                Err(EgoError::Command { model: model.name(), given, takes })
+                let takes = "action or trajectory";
+                Err(EgoError::Command { model: model.name(), given: "pose", takes })
             }
         }
     }
@@ -411,7 +411,7 @@ impl Ego {
         self.dynamics
     }
 
-    /// The present pose.
+    /// The pose of the rig in the world after the last step.
     pub fn world_from_rig(&self) -> Pose {
         self.world_from_rig
     }
@@ -520,6 +520,7 @@ impl Ego {
         let from_s = from_us as f64 * 1e-6;
         let lag_s = match self.dynamics.model {
             DynamicsModel::Dynamic => Vehicle::DEFAULT.lag_s,
+            // The kinematic model reaches a command at once.
             DynamicsModel::Teleport | DynamicsModel::Kinematic => 0.0,
         };
         // Ticks of equal length of at most `TRACKER_TICK_US`, so that the last one is not a

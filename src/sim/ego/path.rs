@@ -101,7 +101,7 @@ impl Path {
         Ok(Self { poses })
     }
 
-    /// The poses.
+    /// The poses relative to the start, by rising time.
     pub fn poses(&self) -> &[TimedPose] {
         &self.poses
     }
@@ -136,8 +136,8 @@ impl Path {
     /// if the path has a single pose. Otherwise a rig that lags behind would get a reference that
     /// starts fast and brakes.
     pub(super) fn reference(&self) -> ReferenceTrajectory {
-        let start = TimedPose { time_us: 0, start_from_rig: Pose::IDENTITY };
-        let start = (self.poses.len() == 1).then_some(start);
+        let origin = TimedPose { time_us: 0, start_from_rig: Pose::IDENTITY };
+        let start = (self.poses.len() == 1).then_some(origin);
         let places: Vec<(f64, DVec2, f64)> = start
             .iter()
             .chain(&self.poses)
@@ -152,8 +152,10 @@ impl Path {
         let last = places.len() - 1;
         // Central differences at each pose; one-sided at the ends.
         let moved = |k: usize| {
-            let (from, to) = (places[k.saturating_sub(1)], places[(k + 1).min(last)]);
-            let (way_m, seconds) = (to.1 - from.1, to.0 - from.0);
+            let from = places[k.saturating_sub(1)];
+            let to = places[(k + 1).min(last)];
+            let way_m = to.1 - from.1;
+            let seconds = to.0 - from.0;
             // The projection on the heading gives the sign: a way against the heading is driving
             // backwards.
             let speed_m_s = way_m.dot(DVec2::from_angle(places[k].2)) / seconds;
@@ -163,7 +165,8 @@ impl Path {
         // Speeds are complete at this point, so accelerations are their differences, in the same
         // way.
         let knot = |k: usize| {
-            let (from, to) = (k.saturating_sub(1), (k + 1).min(last));
+            let from = k.saturating_sub(1);
+            let to = (k + 1).min(last);
             let (time_s, position_m, yaw_rad) = places[k];
             let (speed_m_s, yaw_rate_rad_s) = moves[k];
             let acceleration_m_s2 = (moves[to].0 - moves[from].0) / (places[to].0 - places[from].0);

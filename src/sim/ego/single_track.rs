@@ -116,7 +116,8 @@ impl SingleTrackState {
         let fastest_1_s =
             tyres.stiffness_m_s2() / phase.drive.speed_m_s.abs().max(MIN_INTERVAL_SPEED_M_S);
         let longest_s = MAX_INTERVAL_LAGS * car.lag_s;
-        let (mut begun_s, mut piece_s) = (0.0, (1.0 / fastest_1_s).min(longest_s));
+        let mut begun_s = 0.0;
+        let mut piece_s = (1.0 / fastest_1_s).min(longest_s);
         while begun_s < phase.duration_s {
             let left_s = phase.duration_s - begun_s;
             // Extend the last interval instead of adding one that only covers a rounding error.

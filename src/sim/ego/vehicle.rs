@@ -123,7 +123,8 @@ mod tests {
 
     #[test]
     fn steering_turns_the_car_by_the_curvature_in_the_end() {
-        let (car, tyres) = (Vehicle::DEFAULT, Vehicle::DEFAULT.tyres());
+        let car = Vehicle::DEFAULT;
+        let tyres = Vehicle::DEFAULT.tyres();
         for speed_m_s in [-10.0, -0.5, 1e-3, 5.0, 60.0] {
             let delta_rad = car.steering_rad(0.01, speed_m_s);
             let force = tyres.steer * (speed_m_s * delta_rad);

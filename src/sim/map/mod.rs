@@ -49,8 +49,8 @@ impl Map {
     /// As [`MapFile::check`].
     pub fn new(file: MapFile) -> Result<Self, FileError> {
         file.check()?;
-        let indices = file.lanes.iter().enumerate();
-        let indices = indices.map(|(index, lane)| (lane.id.clone(), index)).collect();
+        let indices =
+            file.lanes.iter().enumerate().map(|(index, lane)| (lane.id.clone(), index)).collect();
         let lanes = file.lanes.iter().map(Outline::from_lane).collect();
         let areas =
             file.areas.iter().map(|area| Outline::from_points(area.outline.iter())).collect();
@@ -58,7 +58,7 @@ impl Map {
         Ok(Self { file, indices, lanes, areas, surface })
     }
 
-    /// The file.
+    /// The file that the map was made of, unchanged.
     pub fn file(&self) -> &MapFile {
         &self.file
     }
@@ -143,7 +143,8 @@ impl Outline {
         for (from_m, to_m) in before.zip(&self.points_m) {
             // Relative to the point, so that the decision is the same at any distance from the
             // origin.
-            let [from, to] = [from_m - point_m, *to_m - point_m];
+            let from = from_m - point_m;
+            let to = *to_m - point_m;
             let cross = from.perp_dot(to);
             // On the line of an edge, and between its ends: the ways to both ends point in opposite
             // directions.
@@ -184,8 +185,8 @@ mod tests {
 
     #[test]
     fn points_are_in_their_lanes_edges_included() {
-        let map = Map::new(MapFile::new(vec![lane("a", 0.0, &["b"]), lane("b", 3.5, &[])], vec![]));
-        let map = map.unwrap();
+        let lanes = vec![lane("a", 0.0, &["b"]), lane("b", 3.5, &[])];
+        let map = Map::new(MapFile::new(lanes, vec![])).unwrap();
         // The lanes are 3.5 m wide and touch at y = 1.75 m. The shared edge is in both.
         let at = |x, y| map.lanes_at(DVec2::new(x, y)).collect::<Vec<_>>();
         assert_eq!(at(10.0, 0.0), [0]);
@@ -200,10 +201,10 @@ mod tests {
 
     #[test]
     fn a_concave_area_excludes_its_bay() {
-        let outline = [[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [2.0, 1.0], [0.0, 4.0]];
+        let corners = [[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [2.0, 1.0], [0.0, 4.0]];
         // At 1e7 m a product of two coordinates has steps of 0.016 m², so that only coordinates
         // relative to the point can decide these.
-        let outline = outline.map(|[x, y]| [x + 1e7, y, 0.0]).to_vec();
+        let outline = corners.map(|[x, y]| [x + 1e7, y, 0.0]).to_vec();
         let area = Area { kind: AreaKind::Drivable, outline };
         let map = Map::new(MapFile::new(vec![], vec![area])).unwrap();
         let is_in = |x: f64, y: f64| map.is_drivable(DVec2::new(x + 1e7, y));

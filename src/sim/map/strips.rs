@@ -55,7 +55,8 @@ pub fn strips_beside(drives: &[Trajectory], left_m: f64, right_m: f64) -> MapFil
         let EgoBox { box_, center_x_m } = EgoBox::default();
         let behind_m = 0.5 * box_.length_m - center_x_m + BEYOND_M;
         let ahead_m = 0.5 * box_.length_m + center_x_m + BEYOND_M;
-        let [first, last] = [&drive.keyframes[0], &drive.keyframes[count - 1]];
+        let first = &drive.keyframes[0];
+        let last = &drive.keyframes[count - 1];
         let end = |keyframe: &Keyframe, x_m: f64| {
             let corner_m = |y_m: f64| DVec3::new(x_m, y_m, 0.0);
             [left_m, -right_m]

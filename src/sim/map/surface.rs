@@ -47,7 +47,7 @@ impl LaneSurface {
         Self { lines: lines.into_iter().map(SurfaceLine::new).collect() }
     }
 
-    /// The middle lines.
+    /// The middle lines of the lanes, with the normal of the road at each point.
     pub fn lines(&self) -> impl Iterator<Item = &[SurfacePoint]> {
         self.lines.iter().map(|line| line.points.as_slice())
     }
@@ -64,20 +64,22 @@ impl LaneSurface {
                 continue;
             }
             for pair in line.points.windows(2) {
-                let [from, to] = [pair[0], pair[1]];
+                let from = pair[0];
+                let to = pair[1];
                 let way_m = to.position_m - from.position_m;
                 // The parameter of the foot of the perpendicular, clamped to the segment. The
                 // minimum of 1e-12 m² makes a segment without length a point.
-                let t = (point_m - from.position_m).dot(way_m) / way_m.length_squared().max(1e-12);
-                let t = t.clamp(0.0, 1.0);
+                let along =
+                    (point_m - from.position_m).dot(way_m) / way_m.length_squared().max(1e-12);
+                let t = along.clamp(0.0, 1.0);
                 let there_m = from.position_m + t * way_m;
                 let distance_m = there_m.distance(point_m);
                 if distance_m < nearest_m {
                     nearest_m = distance_m;
                     // Interpolated, so that a car does not tilt at once where two segments meet.
-                    let up = from.up.lerp(to.up, t);
+                    let between = from.up.lerp(to.up, t);
                     // Normals of a flat road stay exact.
-                    let up = if from.up == to.up { from.up } else { up.normalize() };
+                    let up = if from.up == to.up { from.up } else { between.normalize() };
                     plane = Some(Plane { point_m: there_m, up });
                 }
             }
@@ -105,13 +107,15 @@ impl SurfaceLine {
 /// The edges are compared at equal shares of their lengths.
 fn surface_points(lane: &Lane) -> Vec<SurfacePoint> {
     let center: Vec<DVec3> = lane.center.iter().map(|point| DVec3::from_array(*point)).collect();
-    let [left, right] = [Edge::new(&lane.left), Edge::new(&lane.right)];
+    let left = Edge::new(&lane.left);
+    let right = Edge::new(&lane.right);
     // By share and not by index: edges may have other numbers of points than the middle.
     let shares = length_shares(&center);
     let last = center.len() - 1;
     let points = center.iter().zip(shares).enumerate();
     points
         .map(|(index, (position_m, share))| {
+            // The central difference; at an end of the line, the only segment there.
             let ahead = center[(index + 1).min(last)] - center[index.saturating_sub(1)];
             let across = left.at(share) - right.at(share);
             SurfacePoint { position_m: *position_m, up: normal(ahead, across) }
@@ -128,9 +132,9 @@ fn normal(ahead: DVec3, across: DVec3) -> DVec3 {
     }
     let level = DVec3::new(-ahead.y, ahead.x, 0.0);
     let across = if is_direction(across) { across } else { level };
-    let up = ahead.cross(across);
+    let normal = ahead.cross(across);
     // Edges that are swapped or vertical give a normal that points down or sideways.
-    let up = if is_upright(up) { up } else { ahead.cross(level) };
+    let up = if is_upright(normal) { normal } else { ahead.cross(level) };
     // Exactly vertical on a flat road, so that poses on it stay as they are.
     if up.x == 0.0 && up.y == 0.0 { DVec3::Z } else { up.normalize() }
 }
@@ -160,7 +164,8 @@ impl Edge {
         let after = self.shares.partition_point(|&before| before <= share);
         // The segment that begins at or before the share. At a share of 1 it is the last one.
         let segment = after.saturating_sub(1).min(last);
-        let [from, to] = [self.shares[segment], self.shares[segment + 1]];
+        let from = self.shares[segment];
+        let to = self.shares[segment + 1];
         // A segment without length has equal shares, and its first point is taken.
         let t = ((share - from) / (to - from).max(f64::MIN_POSITIVE)).clamp(0.0, 1.0);
         self.points_m[segment].lerp(self.points_m[segment + 1], t)
@@ -257,8 +262,8 @@ mod tests {
     fn sidewalks_are_no_road_and_degenerate_lanes_are_level_across() {
         let sidewalk = Lane { kind: LaneKind::Sidewalk, ..lane(0.0, 0.0) };
         assert_eq!(LaneSurface::from_driving_lanes(&[sidewalk]), LaneSurface::default());
-        let narrow = lane(0.08, 0.0);
-        let narrow = Lane { left: narrow.center.clone(), right: narrow.center.clone(), ..narrow };
+        let wide = lane(0.08, 0.0);
+        let narrow = Lane { left: wide.center.clone(), right: wide.center.clone(), ..wide };
         let plane =
             LaneSurface::from_lanes([narrow].iter()).plane_near(DVec3::X * 50.0, 25.0).unwrap();
         assert!((plane.up - DVec3::new(-0.08, 0.0, 1.0).normalize()).length() < 1e-12);

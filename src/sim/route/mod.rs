@@ -116,8 +116,8 @@ impl NavigationRoute {
         let length_m = self.course.length_m();
         let stations_m = (0..limits::ROUTE_POINTS)
             .map(|point| progress.station_m + f64::from(point) * POINT_SPACING_M);
-        let points_m = stations_m.take_while(|station_m| *station_m <= length_m).map(in_rig_m);
-        let points_m = points_m.collect();
+        let points_m =
+            stations_m.take_while(|station_m| *station_m <= length_m).map(in_rig_m).collect();
         let (command, text) = match self.next_command(progress.station_m) {
             Some((command, text)) => (command, text),
             // A route without commands derives them from its own shape, as NeuroNCAP does.

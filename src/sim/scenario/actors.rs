@@ -54,11 +54,11 @@ pub(super) fn actors_from(
     let mut actors: Vec<Actor> = Vec::with_capacity(count);
     for (section, track) in tracks {
         let box_ = box_from("tracks", section.size)?;
-        let asset = named_asset("tracks", section.asset.as_deref(), around)?;
+        let named = named_asset("tracks", section.asset.as_deref(), around)?;
         // A track that names an asset gets it, or none if it names `none`. Only one without a name
         // gets a default.
         let asset = match &section.asset {
-            Some(_) => asset,
+            Some(_) => named,
             None => default_asset("tracks", section.class, &box_, around)?,
         };
         actors.push(Actor {
@@ -129,9 +129,9 @@ fn recorded<'a>(
     section.start_us = Some(start_us);
     let kept = tracks.tracks.iter().filter(|track| !section.without.contains(&track.id));
     kept.map(|track| {
-        let shifted = track.shifted(start_us);
-        let shifted =
-            shifted.map_err(|error| error.within(&format!("tracks.file: track {:?}", track.id)))?;
+        let shifted = track
+            .shifted(start_us)
+            .map_err(|error| error.within(&format!("tracks.file: track {:?}", track.id)))?;
         Ok((track, shifted))
     })
     .collect()
@@ -139,6 +139,7 @@ fn recorded<'a>(
 
 /// When the recorded drive passed the ego's start, in microseconds.
 fn start_time_us(around: &Surroundings<'_>, start: Option<&EgoStart>) -> i64 {
+    // Without a place on a recorded drive, the clock of the tracks is that of the episode.
     let Some(EgoStart::Station { trajectory, station_m }) = start else { return 0 };
     let drive = around.drives.iter().find(|drive| drive.name == *trajectory);
     let route = drive.and_then(|drive| Route::new(drive).ok());
@@ -246,11 +247,11 @@ fn actor_from(
         (None, None) => usual_box(class),
     };
     // The default asset depends on the box, so it is looked up last.
-    let asset = match &section.asset {
+    let shown = match &section.asset {
         Some(_) => asset,
         None => default_asset("asset", class, &box_, around)?,
     };
-    let asset = asset.map(|asset| asset.hash);
+    let asset = shown.map(|asset| asset.hash);
     // An actor that is not drawn keeps the word for it, so that it is not drawn again either. One
     // that gets an asset by its size keeps that size: the asset's own would be taken the next time.
     if asset.is_some() {
@@ -322,8 +323,8 @@ fn follower_from(
         .map_err(|error| error.within(field))?;
     let length_m = course.length_m();
     let station_m = in_range(&format!("{field}.station_m"), path.station_m, [0.0, length_m])?;
-    let offset_m = path.offset_m.unwrap_or(0.0);
-    let offset_m = in_range(&format!("{field}.offset_m"), offset_m, [-100.0, 100.0])?;
+    let given_m = path.offset_m.unwrap_or(0.0);
+    let offset_m = in_range(&format!("{field}.offset_m"), given_m, [-100.0, 100.0])?;
     let most_mps = limits::ACTOR_SPEED_M_S;
     let speed_mps = in_range(&format!("{field}.speed"), path.speed, [0.0, most_mps])?;
     Ok(CourseFollower {

@@ -57,8 +57,7 @@ fn through_positions(
         })?;
         points_m.push(pose.position_m);
     }
-    let yaw_rad = section.yaw_rad.unwrap_or(0.0);
-    let yaw_rad = in_range("yaw_rad", yaw_rad, [-100.0, 100.0])?;
+    let yaw_rad = in_range("yaw_rad", section.yaw_rad.unwrap_or(0.0), [-100.0, 100.0])?;
     // The jitter needs one direction for all positions, so that the shape of the way stays.
     let first_rad = facing_rad(&points_m, 0).unwrap_or(yaw_rad);
     let shift_m = displacement_m(drawn, along_rad.unwrap_or(first_rad));
@@ -101,17 +100,17 @@ fn meeting(
     let needed = |field: &str, value: Option<f64>| {
         value.ok_or_else(|| FileError::new(field, "is missing; write it beside along"))
     };
-    let station_m = needed("station_m", section.station_m)?;
-    let station_m = in_range("station_m", station_m, [0.0, drive.length_m()])?;
+    let given_m = needed("station_m", section.station_m)?;
+    let station_m = in_range("station_m", given_m, [0.0, drive.length_m()])?;
     let time_s = in_range("time_s", needed("time_s", section.time_s)?, [0.0, 3600.0])?;
     let angle_rad = in_range("angle_rad", needed("angle_rad", section.angle_rad)?, [-10.0, 10.0])?;
-    let speed_mps = needed("speed", section.speed)?;
-    let speed_mps = in_range("speed", speed_mps, [0.0, limits::ACTOR_SPEED_M_S])?;
+    let given_mps = needed("speed", section.speed)?;
+    let speed_mps = in_range("speed", given_mps, [0.0, limits::ACTOR_SPEED_M_S])?;
     let meeting = drive.at_station(station_m);
     let turned = meeting.rotation * DQuat::from_rotation_z(angle_rad);
-    let meeting = Pose { rotation: turned.normalize(), ..meeting };
+    let crossing = Pose { rotation: turned.normalize(), ..meeting };
     // Without a direction, along is the heading of the actor itself, after it was turned.
-    let meeting = displaced(&meeting, drawn, Some(along_rad.unwrap_or(heading_rad(&meeting))));
+    let meeting = displaced(&crossing, drawn, Some(along_rad.unwrap_or(heading_rad(&crossing))));
     let ahead = meeting.rotation * DVec3::X;
     let at = |time_us: i64| {
         let way_m = speed_mps * (time_us as f64 * 1e-6 - time_s) * ahead;

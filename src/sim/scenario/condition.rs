@@ -49,9 +49,11 @@ fn part(
     references: &References<'_>,
     (depth, count): (usize, &mut usize),
 ) -> Result<Condition, FileError> {
+    // Counted before its parts, so that the limit also ends the recursion.
     *count += 1;
     if *count > limits::CONDITIONS || depth > limits::CONDITION_DEPTH {
-        let [most, deepest] = [limits::CONDITIONS, limits::CONDITION_DEPTH];
+        let most = limits::CONDITIONS;
+        let deepest = limits::CONDITION_DEPTH;
         let message = format!("at most {most} conditions, {deepest} deep, are accepted");
         return Err(FileError::new("all", message));
     }
@@ -66,6 +68,7 @@ fn part(
     };
     let all = parts("all", &section.all)?;
     let any = parts("any", &section.any)?;
+    // The bound keeps the product far within 64 bits.
     let microseconds = |path: &str, value_s: f64| -> Result<i64, FileError> {
         Ok((in_range(path, value_s, [0.0, limits::END_S])? * 1e6).round() as i64)
     };
@@ -104,8 +107,12 @@ fn part(
     };
     let later_s = in_range("later_s", section.later_s.unwrap_or(0.0), [0.0, limits::LATER_S])?;
     let held_us = microseconds("held_s", section.held_s.unwrap_or(0.0))?;
-    let measure = section.measure.as_ref().map(|section| measure(section, references));
-    let measure = measure.transpose().map_err(|error| error.within("measure"))?;
+    let measure = section
+        .measure
+        .as_ref()
+        .map(|section| measure(section, references))
+        .transpose()
+        .map_err(|error| error.within("measure"))?;
     Ok(Condition {
         time_us: section.time_s.map(|time_s| microseconds("time_s", time_s)).transpose()?,
         near,
@@ -212,6 +219,7 @@ fn trigger_named(
     };
     // Both lists have an entry for each actor, so the index is valid.
     let triggers = &references.triggers[actor];
+    // A trigger without a name has an empty one in the list, which no reference may find.
     let trigger = triggers.iter().position(|other| !name.is_empty() && other == name);
     Ok(After { actor, trigger: trigger.ok_or_else(missing)?, phase: Phase::Fired, delay_us: 0 })
 }

@@ -40,9 +40,9 @@ impl<'a> Courses<'a> {
                     return Ok(course.clone());
                 }
                 let drive = drive_named(field, name, self.around.drives)?;
-                let course = Course::from_drive(drive);
-                let course = course.ok_or_else(|| FileError::new(field, none()))?;
-                let course = Arc::new(if reverse { course.reversed() } else { course });
+                let ahead =
+                    Course::from_drive(drive).ok_or_else(|| FileError::new(field, none()))?;
+                let course = Arc::new(if reverse { ahead.reversed() } else { ahead });
                 self.drives.insert(key, course.clone());
                 return Ok(course);
             }

@@ -66,8 +66,12 @@ impl Scenario {
         {
             section.station_m = Some(*station_m);
         }
-        let dynamics = file.ego.dynamics.map(dynamics_from).transpose();
-        let dynamics = dynamics.map_err(|error| error.within("ego"))?;
+        let dynamics = file
+            .ego
+            .dynamics
+            .map(dynamics_from)
+            .transpose()
+            .map_err(|error| error.within("ego"))?;
         let ego_box = match &file.ego.box_ {
             None => EgoBox::default(),
             Some(section) => {
@@ -90,8 +94,13 @@ impl Scenario {
             actors_from(&mut file, seed, around, start.as_ref(), &mut courses)?;
         let references = References { indices: &indices, triggers: &trigger_names };
         // The end may name every trigger, so its condition comes after the actors.
-        let when = file.end.when.as_ref().map(|when| condition(when, None, &references));
-        let when = when.transpose().map_err(|error| error.within("end.when"))?;
+        let when = file
+            .end
+            .when
+            .as_ref()
+            .map(|when| condition(when, None, &references))
+            .transpose()
+            .map_err(|error| error.within("end.when"))?;
         let end = end_rules(&file.end, route.is_some()).map_err(|error| error.within("end"))?;
         if let Some(progress) = file.verdict.progress {
             in_range("verdict.progress", progress, [0.0, 1.0])?;
@@ -159,9 +168,9 @@ fn ego_start(
         (Some(name), None) => {
             let drive = drive_named("start.trajectory", name, drives)?;
             let length_m = drive.length_m();
-            let station_m = start.station_m.unwrap_or(0.0);
-            let station_m = in_range("start.station_m", station_m, [0.0, length_m])?;
-            let station_m = shifted(drive, station_m, seed, frames)
+            let given_m = start.station_m.unwrap_or(0.0);
+            let checked_m = in_range("start.station_m", given_m, [0.0, length_m])?;
+            let station_m = shifted(drive, checked_m, seed, frames)
                 .map_err(|message| FileError::new("start", message))?;
             Ok(Some(EgoStart::Station { trajectory: name.clone(), station_m }))
         }
@@ -180,6 +189,7 @@ fn shifted(drive: &Trajectory, station_m: f64, seed: u64, frames: u32) -> Result
     // `Route::new` has checked that the drive has keyframes.
     let first_us = drive.keyframes[0].time_us;
     let last_us = drive.keyframes[drive.keyframes.len() - 1].time_us;
+    // A shift beyond the ends of the drive starts at its end.
     let time_us = route.at(station_m).time_us.saturating_add(shift_us).clamp(first_us, last_us);
     // Between the two keyframes around that time.
     let last = drive.keyframes.len() - 1;
@@ -187,7 +197,8 @@ fn shifted(drive: &Trajectory, station_m: f64, seed: u64, frames: u32) -> Result
     let stations_m = route.stations_m();
     // The time is that of the first keyframe.
     let Some(before) = after.checked_sub(1) else { return Ok(0.0) };
-    let [from, to] = [&drive.keyframes[before], &drive.keyframes[after]];
+    let from = &drive.keyframes[before];
+    let to = &drive.keyframes[after];
     // In 128 bits, because the difference of two times of 64 bits may not fit. Times rise, so the
     // span is above 0.
     let span_us = i128::from(to.time_us) - i128::from(from.time_us);
@@ -224,8 +235,8 @@ fn route_from(
         let station_m =
             in_range(&format!("{path}.station_m"), command.station_m, [before_m, length_m])?;
         before_m = station_m;
-        let ahead_m = command.ahead_m.unwrap_or(COMMAND_AHEAD_M);
-        let ahead_m = in_range(&format!("{path}.ahead_m"), ahead_m, [0.0, 1e6])?;
+        let given_m = command.ahead_m.unwrap_or(COMMAND_AHEAD_M);
+        let ahead_m = in_range(&format!("{path}.ahead_m"), given_m, [0.0, 1e6])?;
         if command.text.as_ref().is_some_and(|text| text.len() > limits::COMMAND_BYTES) {
             let message = format!("longer than {} bytes", limits::COMMAND_BYTES);
             return Err(FileError::new(format!("{path}.text"), message));
@@ -250,8 +261,10 @@ fn end_rules(section: &EndSection, has_route: bool) -> Result<EndRules, FileErro
         let value_s = value_s.map(|value_s| in_range(path, value_s, [0.001, limits::END_S]));
         Ok(value_s.transpose()?.map(|value_s| (value_s * 1e6).round() as i64))
     };
-    let off_route_m = section.off_route_m.map(|most_m| in_range("off_route_m", most_m, [0.1, 1e6]));
-    let off_route_m = off_route_m.transpose()?;
+    let off_route_m = section
+        .off_route_m
+        .map(|most_m| in_range("off_route_m", most_m, [0.1, 1e6]))
+        .transpose()?;
     // Without a route the distance is unknown and the rule could never end the episode.
     if off_route_m.is_some() && !has_route {
         let message = "there is no route; write one, or start along a trajectory";
@@ -262,6 +275,7 @@ fn end_rules(section: &EndSection, has_route: bool) -> Result<EndRules, FileErro
         off_route_m,
         contact: section.contact,
         stuck_us: microseconds("stuck_s", section.stuck_s)?,
+        // By default an episode ends with its route, if there is one.
         route_done: section.route_done.unwrap_or(true) && has_route,
     })
 }

@@ -28,13 +28,14 @@ pub(super) fn add_script(
         if let Some(name) = &trigger.name {
             named(&format!("{path}.name"), name)?;
             let names = &references.triggers[own];
+            // The list has this trigger's own name, too.
             if names.iter().filter(|other| *other == name).count() > 1 {
                 let message = format!("{name:?} is there twice; give each trigger its own name");
                 return Err(FileError::new(format!("{path}.name"), message));
             }
         }
-        let when = condition(&trigger.when, Some(own), references);
-        let when = when.map_err(|error| error.within(&format!("{path}.when")))?;
+        let when = condition(&trigger.when, Some(own), references)
+            .map_err(|error| error.within(&format!("{path}.when")))?;
         // A trigger without actions is an instant that `after` may name.
         let is_empty = trigger.then.is_empty() && trigger.name.is_none();
         if is_empty || trigger.then.len() > limits::ACTIONS {
@@ -48,6 +49,7 @@ pub(super) fn add_script(
         // Actions stay in order: later ones replace what earlier ones of the same sub-step began.
         let mut then = Vec::with_capacity(trigger.then.len());
         for (at, action) in trigger.then.iter().enumerate() {
+            // An action may add a course to the follower, and then names it by its index.
             let action = action_from(action, &mut actor.behaviour, courses, (references, own));
             then.push(action.map_err(|error| error.within(&format!("{path}.do[{at}]")))?);
         }
@@ -73,8 +75,9 @@ fn profile(section: &ProfileSection) -> Result<(Over, Shape), FileError> {
             .acceleration
             .map(|most| Ok(Over::Acceleration(in_range("acceleration", most, [1e-3, 1e3])?))),
     ];
-    let mut given = given.into_iter().flatten();
-    match (shape, given.next(), given.next()) {
+    let mut written = given.into_iter().flatten();
+    // The first two tell whether there is none, one, or too many.
+    match (shape, written.next(), written.next()) {
         (Shape::Step, None, _) => Ok((Over::Time(0.0), shape)),
         (Shape::Linear | Shape::Sinusoidal | Shape::Cubic, Some(over), None) => Ok((over?, shape)),
         _ => {
@@ -136,8 +139,8 @@ fn action_from(
             }
         }
         ActionSection::KeepDistance(section) => {
-            let keep = keep_distance(section, (references, own));
-            let keep = keep.map_err(|error| error.within("keep_distance"))?;
+            let keep = keep_distance(section, (references, own))
+                .map_err(|error| error.within("keep_distance"))?;
             // The model computes the acceleration of an IDM actor, so that a jump would break its
             // gap.
             let is_idm = matches!(behaviour, Behaviour::Follow(follow) if follow.idm.is_some());
@@ -172,13 +175,18 @@ fn action_from(
             let along = line.along.as_deref();
             let points = line.points.as_deref();
             let lanes = line.lanes.as_deref();
-            let course = courses.line("along", along, points, lanes, reverse);
-            let course = course.map_err(|error| error.within("path"))?;
+            let course = courses
+                .line("along", along, points, lanes, reverse)
+                .map_err(|error| error.within("path"))?;
             // Both places are on the line of this action and not on the present course.
-            let done_m = line.done_m.map(|m| in_range("path.done_m", m, [0.0, course.length_m()]));
-            let done_m = done_m.transpose()?;
-            let at_m = line.at_m.map(|m| in_range("path.at_m", m, [0.0, course.length_m()]));
-            let at_m = at_m.transpose()?;
+            let done_m = line
+                .done_m
+                .map(|m| in_range("path.done_m", m, [0.0, course.length_m()]))
+                .transpose()?;
+            let at_m = line
+                .at_m
+                .map(|m| in_range("path.at_m", m, [0.0, course.length_m()]))
+                .transpose()?;
             // Courses are only appended, so that the indices of earlier actions stay valid.
             if let Behaviour::Follow(follow) = behaviour {
                 let follow = Arc::make_mut(follow);

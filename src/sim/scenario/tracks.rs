@@ -90,11 +90,12 @@ impl TracksFile {
                 let message = format!("{:?} is there twice; give each track its own id", track.id);
                 return Err(within(FileError::new("id", message)));
             }
-            // A hash is a name of 64 characters, and so is `none`.
+            // Hashes and `none` have the form of a name, too.
             if let Some(asset) = &track.asset {
                 named("asset", asset).map_err(within)?;
             }
             box_from("size", track.size).map_err(within)?;
+            // For its checks only: when the episode starts is not known yet.
             track.shifted(0).map_err(within)?;
         }
         Ok(())

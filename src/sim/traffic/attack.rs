@@ -103,7 +103,8 @@ impl Spline {
         let velocities: [DVec2; PLAN_POINTS + 1] =
             std::array::from_fn(|at| self.velocity_mps(at as f64 * POINT_S));
         velocities.windows(2).all(|pair| {
-            let [before, after] = [pair[0], pair[1]];
+            let before = pair[0];
+            let after = pair[1];
             // Below 0.1 m/s the direction of the velocity is no heading.
             // Both must be fast enough: the angle between them needs two directions.
             let turn_rad = if before.length().min(after.length()) < 0.1 {

@@ -122,6 +122,7 @@ impl Motion {
     ) -> bool {
         let MotionStep { seed, bodies, begin_us, end_us } = *step;
         match self {
+            // The pose of a track follows from the time alone.
             Self::Track(_) => {}
             Self::Follow { follower, now } => {
                 let duration_s = (end_us - begin_us) as f64 * 1e-6;
@@ -131,6 +132,8 @@ impl Motion {
                 }
             }
             Self::Attack { attack, plan } => {
+                // The motion before the first plan is a straight line that no plan chose, so the
+                // first is due at once.
                 let is_first = plan.plans == 0;
                 let is_due = begin_us.saturating_sub(plan.begin_us) >= attack.plan_us;
                 if before.present && (is_first || is_due) {
@@ -189,6 +192,8 @@ impl AttackPlan {
             let velocity_mps = (begin_from_world.rotation * body.velocity_mps).truncate();
             attack::predicted(at_m, velocity_mps, body.yaw_rate_radps)
         };
+        // The ego is first in `bodies`. The attacker's own box is among the others and is no
+        // neighbour.
         let attacked = predicted(&bodies[0]);
         let others = bodies[1..].iter().filter(|body| body.actor != Some(own.index));
         let neighbours: Vec<attack::Points> = others.map(predicted).collect();
@@ -226,6 +231,7 @@ impl AttackPlan {
             position_m: begin.transform_point(at_m.extend(0.0)),
             rotation: rotation.normalize(),
         };
+        // At the start there is no earlier pose to turn from.
         let yaw_rate_radps = before.map_or(0.0, |(before, duration_s)| {
             turned_rad(before.rotation, pose.rotation) / duration_s
         });

@@ -171,12 +171,14 @@ impl Measures<'_> {
         is_along: bool,
     ) -> Option<f64> {
         let to = self.body(&other.to)?;
-        let [from_m, to_m] = [reference_m(body, of), reference_m(to, &other.to)];
+        let from_m = reference_m(body, of);
+        let to_m = reference_m(to, &other.to);
         // The course is used only if it was asked for. An actor without one falls back to the
         // heading.
         let (forward, way_m) = match self.course.filter(|_| other.is_on_course) {
             Some(course) => {
-                let [from, to] = [course.nearest(from_m), course.nearest(to_m)];
+                let from = course.nearest(from_m);
+                let to = course.nearest(to_m);
                 let forward = course.at(from.station_m).rotation * DVec3::X;
                 let way_m =
                     if is_along { to.station_m - from.station_m } else { to.left_m - from.left_m };

@@ -105,6 +105,7 @@ impl Course {
 
     /// This line in the opposite direction.
     pub fn reversed(&self) -> Self {
+        // About the own z axis, so that up stays up.
         let half_turn = DQuat::from_rotation_z(std::f64::consts::PI);
         let length_m = self.length_m();
         let turned = |pose: &Pose| Pose {
@@ -115,7 +116,7 @@ impl Course {
         Self::new(self.poses.iter().rev().map(turned).collect(), stations_m.collect())
     }
 
-    /// Length, in metres.
+    /// Length of the way through the poses, in metres; above 0.
     pub fn length_m(&self) -> f64 {
         self.stations_m[self.stations_m.len() - 1]
     }
@@ -123,7 +124,8 @@ impl Course {
     /// The pose at a station, in metres.
     pub fn at(&self, station_m: f64) -> Pose {
         let (segment, t) = self.segment(station_m);
-        let [from, to] = [&self.poses[segment], &self.poses[segment + 1]];
+        let from = &self.poses[segment];
+        let to = &self.poses[segment + 1];
         Pose {
             position_m: from.position_m.lerp(to.position_m, t),
             // Position continues straight beyond the ends, but the rotation must not turn on.
@@ -144,7 +146,8 @@ impl Course {
             return 0.0;
         }
         let (segment, _) = self.segment(station_m);
-        let [from, to] = [&self.poses[segment], &self.poses[segment + 1]];
+        let from = &self.poses[segment];
+        let to = &self.poses[segment + 1];
         let way_m = self.stations_m[segment + 1] - self.stations_m[segment];
         turned_rad(from.rotation, to.rotation) / way_m
     }
@@ -156,6 +159,8 @@ impl Course {
 
     /// The nearest place to a point between two stations.
     pub fn nearest_between(&self, point_m: DVec3, from_m: f64, to_m: f64) -> CourseFootPoint {
+        // Whole segments are tested, so that the place may lie a little outside of the two
+        // stations.
         let (first, _) = self.segment(from_m);
         let (last, _) = self.segment(to_m);
         let mut best =
@@ -233,7 +238,7 @@ impl Course {
     }
 }
 
-/// The horizontal part.
+/// The vector without its vertical part.
 pub(super) fn flat(vector: DVec3) -> DVec3 {
     DVec3::new(vector.x, vector.y, 0.0)
 }

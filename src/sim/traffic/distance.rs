@@ -37,7 +37,7 @@ pub struct KeepDistance {
     pub bounds: Option<Bounds>,
 }
 
-/// A distance.
+/// A distance to another body, as a length or as a time.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Gap {
     Length(f64),

@@ -57,7 +57,8 @@ impl EgoMotion {
         }
         // Both ends are excluded above, so that 0 < t < 1.
         let t = since_us as f64 / dt_us as f64;
-        let [from, to] = [&self.from, &self.to];
+        let from = &self.from;
+        let to = &self.to;
         let mut pose = from.world_from_rig.interpolate(&to.world_from_rig, t);
         if self.smooth {
             let dt_s = dt_us as f64 * 1e-6;

@@ -81,6 +81,8 @@ impl CourseFollower {
             course: 0,
             station_m: self.station_m,
             speed_mps: self.speed_mps,
+            // With the model the actor aims at the model's speed on a free road, and else keeps its
+            // own.
             free_flow_speed_mps: self.idm.map_or(self.speed_mps, |idm| idm.free_speed_mps),
             speed_command: None,
             lateral: Lateral::at(self.offset_m),
@@ -334,6 +336,7 @@ impl CourseFollowerState {
             self.lateral = Lateral::at(self.lateral.offset_m());
             self.by.offset = None;
         }
+        // Only the change ends. The actor stays on the course that it has begun.
         if self.by.course == Some(trigger) {
             self.by.course = None;
         }

@@ -94,7 +94,10 @@ impl Lateral {
         // The first three coefficients give offset, rate and acceleration now. The last three make
         // offset, rate and acceleration at the end those of the aim.
         let t = duration_s;
-        let [t2, t3, t4, t5] = [t * t, t.powi(3), t.powi(4), t.powi(5)];
+        let t2 = t * t;
+        let t3 = t.powi(3);
+        let t4 = t.powi(4);
+        let t5 = t.powi(5);
         let cubic = (20.0 * way_m - 12.0 * rate * t - 3.0 * acceleration * t2) / (2.0 * t3);
         let quartic = (-30.0 * way_m + 16.0 * rate * t + 3.0 * acceleration * t2) / (2.0 * t4);
         let quintic = (12.0 * way_m - 6.0 * rate * t - acceleration * t2) / (2.0 * t5);
@@ -139,7 +142,8 @@ impl Lateral {
         let [a, b, c, d, e, f] = self.coefficients;
         let t = self.elapsed_s;
         if let Some(Profile { from_m, shape }) = self.profile {
-            let [way_m, x] = [self.target_m - from_m, t / self.duration_s];
+            let way_m = self.target_m - from_m;
+            let x = t / self.duration_s;
             // A quintic that follows starts with the rate, and without acceleration.
             return [from_m + way_m * shape.at(x), way_m * shape.slope(x) / self.duration_s, 0.0];
         }

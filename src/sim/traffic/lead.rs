@@ -118,6 +118,7 @@ impl LeadCandidate {
         let between = other.center_m - self.center_m;
         let axes = [self.forward, other.forward].map(|axis| [axis, DVec3::Z.cross(axis)]);
         axes.into_iter().flatten().all(|axis| {
+            // Below and not equal: boxes that touch do not overlap.
             between.dot(axis).abs() < self.half_extent_m(axis) + other.half_extent_m(axis)
         })
     }
@@ -210,6 +211,8 @@ fn found_in(
     let pose = course.at(beside.station_m);
     // A bridge above is not in the way.
     let above_m = body.center_m.z - pose.position_m.z;
+    // The boxes stand on their z, so they overlap in height if neither begins above the other's
+    // roof.
     if above_m >= corridor.height_m || above_m <= -body.height_m {
         return None;
     }

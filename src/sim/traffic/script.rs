@@ -175,7 +175,7 @@ pub enum Shape {
     Linear,
     /// A half wave: `(1 - cos πx) / 2`.
     Sinusoidal,
-    /// `3x² - 2x³`.
+    /// `3x² - 2x³`: its slope is 0 at both ends.
     Cubic,
 }
 
@@ -195,6 +195,7 @@ impl Shape {
     pub(super) fn slope(self, x: f64) -> f64 {
         use std::f64::consts::PI;
         match self {
+            // Before its begin and after its end a change stands still.
             _ if !(0.0..=1.0).contains(&x) => 0.0,
             Self::Step => 0.0,
             Self::Linear => 1.0,
@@ -233,7 +234,7 @@ pub struct Measure {
     pub below: Option<f64>,
 }
 
-/// What is measured.
+/// A number of a body, in its place or relative to another body.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Quantity {
     /// The speed, in m/s.

@@ -62,6 +62,7 @@ impl SpeedProfile {
         let extent = shape.extent(to_mps - from_mps, over);
         let over_s = match over {
             // Every shape here is symmetric, so that its mean speed is that of its ends.
+            // The minimum keeps the time finite for a change from standing to standing.
             Over::Distance(_) => 2.0 * extent / (from_mps + to_mps).max(1e-3),
             _ => extent,
         };
@@ -131,6 +132,7 @@ impl SpeedCommand {
         match self {
             Self::To { to_mps, .. } => speed_mps == *to_mps,
             Self::Profile(profile) => profile.elapsed_s >= profile.over_s,
+            // Never: the other may change its speed at any time.
             Self::Match(_) => false,
             Self::Keep(keep) => keep.is_over(place, bodies),
             Self::Arrive(arrive) => arrive.is_over(place, bodies),

@@ -65,7 +65,7 @@ impl EgoState {
 }
 
 impl Default for EgoBox {
-    /// AlpaSim's vehicle.
+    /// The box of the vehicle that AlpaSim drives.
     fn default() -> Self {
         let box_ = ActorBox { length_m: 5.393, width_m: 2.109, height_m: 1.503 };
         Self { box_, center_x_m: 1.3 }

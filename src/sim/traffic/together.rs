@@ -64,8 +64,8 @@ impl ArriveTogether {
     fn rest(&self, place: &Place<'_>, bodies: &[LeadCandidate]) -> Option<Rest> {
         let body = LeadCandidate::find(bodies, self.of)?;
         let other_mps = body.velocity_mps.length();
-        let to = self.of_at_m - (body.center_m + self.to_ahead_m * body.forward());
-        let to = DVec3::new(to.x, to.y, 0.0);
+        let way_m = self.of_at_m - (body.center_m + self.to_ahead_m * body.forward());
+        let to = DVec3::new(way_m.x, way_m.y, 0.0);
         // Way to the place in the axes of the other: ahead of it, and to the side.
         let ahead_m = to.dot(body.forward());
         // Pythagoras; the maximum catches a negative rounding error.
@@ -77,11 +77,11 @@ impl ArriveTogether {
         let is_other_there =
             to.length() <= self.of_within_m || (is_before_it && ahead_m <= 0.0 && ahead_m > -50.0);
         let time_s = if other_mps < STANDS_MPS { f64::INFINITY } else { other_m / other_mps };
-        let speed_mps = self.speed.map(|speed| match speed {
+        let aim_mps = self.speed.map(|speed| match speed {
             FinalSpeed::Absolute(speed_mps) => speed_mps,
             FinalSpeed::Relative { factor, delta_mps } => factor * other_mps + delta_mps,
         });
-        let speed_mps = speed_mps.map(|mps| mps.clamp(0.0, limits::ACTOR_SPEED_M_S));
+        let speed_mps = aim_mps.map(|mps| mps.clamp(0.0, limits::ACTOR_SPEED_M_S));
         let own_m = place.course.nearest(self.at_m).station_m - self.ahead_m;
         Some(Rest { way_m: own_m - place.station_m, time_s, speed_mps, is_other_there })
     }
@@ -174,7 +174,10 @@ mod tests {
 
     #[test]
     fn it_follows_the_cubic_of_its_ends() {
-        let [way_m, time_s, from_mps, to_mps] = [60.0, 5.0, 8.0, 14.0];
+        let way_m = 60.0;
+        let time_s = 5.0;
+        let from_mps = 8.0;
+        let to_mps = 14.0;
         for (index, [place_m, speed_mps]) in
             driven(way_m, time_s, from_mps, to_mps).into_iter().enumerate()
         {

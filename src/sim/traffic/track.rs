@@ -88,7 +88,7 @@ impl Track {
         Self { held: true, ..self }
     }
 
-    /// The keyframes.
+    /// The keyframes, by rising time.
     pub fn keyframes(&self) -> &[TrackKeyframe] {
         &self.keyframes
     }
@@ -112,7 +112,8 @@ impl Track {
         // At the last keyframe `partition_point` is past the end. The clamp makes it the end of the
         // last segment.
         let after = self.keyframes.partition_point(|key| key.time_us <= time_us).clamp(1, last);
-        let [from, to] = [&self.keyframes[after - 1], &self.keyframes[after]];
+        let from = &self.keyframes[after - 1];
+        let to = &self.keyframes[after];
         // i128, since the difference of two i64 times may overflow i64.
         let span_us = (i128::from(to.time_us) - i128::from(from.time_us)) as f64;
         let since_us = (i128::from(time_us) - i128::from(from.time_us)) as f64;

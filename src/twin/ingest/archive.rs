@@ -136,6 +136,7 @@ impl Archive {
         let mut placing = self.find(|name| name.ends_with(".usdc") || name.ends_with(".usd"));
         for name in self.find(|name| name.ends_with(".usda")) {
             let bytes = self.read(&name, limits::SCENE_PART_BYTES)?;
+            // Searched and not parsed: any transform in the layer is reason enough to warn.
             if bytes.windows(XFORM.len()).any(|part| part == XFORM) {
                 placing.push(name);
             }
@@ -156,6 +157,7 @@ impl SceneFiles for Archive {
             return Err(error(name, format!("{size} bytes; at most {limit_bytes} are read")));
         }
         self.budget.unpack("zip", name, size.into())?;
+        // Grows with what is read, because the size in the directory is only a claim.
         let mut bytes = Vec::new();
         // One byte more, so that the checksum is compared, and a file longer than its entry says is
         // refused.
@@ -183,6 +185,7 @@ fn check_end(bytes: &[u8]) -> Result<(), IngestError> {
         record.starts_with(b"PK\x05\x06") && record.len() == RECORD_BYTES + comment
     };
     let last = bytes.len().saturating_sub(RECORD_BYTES);
+    // The comment of the record takes at most 65,535 bytes.
     let first = last.saturating_sub(usize::from(u16::MAX));
     if bytes.len() >= RECORD_BYTES && (first..=last).rev().any(is_record_at) {
         Ok(())

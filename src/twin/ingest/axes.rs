@@ -59,6 +59,7 @@ impl Axes {
 
     /// `None` if the rows are not orthonormal.
     fn orthonormal(rows: [[f64; 3]; 3]) -> Option<Self> {
+        // glam takes columns, and these are rows.
         let given = DMat3::from_cols_array_2d(&rows).transpose();
         let error = given * given.transpose() - DMat3::IDENTITY;
         let is_orthonormal = error.to_cols_array().iter().all(|e| e.abs() <= Self::MAX_ERROR);
@@ -69,6 +70,7 @@ impl Axes {
         let [x, y, z] = rows.map(DVec3::from_array);
         let x = x.normalize();
         let y = (y - x * x.dot(y)).normalize();
+        // Its cross product is right-handed. The sign of the given z restores a reflection.
         let z_right = x.cross(y);
         let z = z_right * z_right.dot(z).signum();
         Some(Self { twin_from_file: DMat3::from_cols(x, y, z).transpose(), ..Self::IDENTITY })
@@ -98,6 +100,7 @@ impl Axes {
 
     /// The change from these axes to those of `other`, without a change of the unit.
     pub(super) fn to(&self, other: &Self) -> Self {
+        // To the twin's axes and back from them: the inverse of a rotation is its transpose.
         let twin_from_file = other.twin_from_file.transpose() * self.twin_from_file;
         Self { twin_from_file, ..Self::IDENTITY }
     }
@@ -123,6 +126,7 @@ impl Axes {
     /// camera has a pose.
     pub fn alignment(&self) -> Option<Alignment> {
         let is_mirrored = self.twin_from_file.determinant() < 0.0;
+        // Without a reflection the matrix is a rotation; with one the value is not used.
         let rotation = DQuat::from_mat3(&self.twin_from_file).normalize();
         let new_from_old = Pose { rotation, ..Pose::IDENTITY };
         let metres_per_unit = self.metres_per_unit;
@@ -166,16 +170,20 @@ impl Axes {
         for mean in &mut gaussians.means_m {
             *mean = (matrix * DVec3::from_array(*mean)).to_array();
         }
+        // See `apply`: the negative of a reflection in three dimensions is a rotation.
         let rotation = DQuat::from_mat3(&if matrix.determinant() < 0.0 { -matrix } else { matrix });
         for quat in &mut gaussians.quats_wxyz {
             let [w, x, y, z] = quat.map(f64::from);
             let turned = rotation * DQuat::from_xyzw(x, y, z, w);
             *quat = [turned.w, turned.x, turned.y, turned.z].map(|q| q as f32);
         }
+        // SH of odd degree change their sign under a reflection, so the colours need the matrix
+        // itself.
         let turn = sh::ShRotation::new(matrix, gaussians.sh_degree);
         for colour in gaussians.sh.chunks_exact_mut(3 * sh::coefficients(gaussians.sh_degree)) {
             turn.apply(colour);
         }
+        // A rotation mixes the coefficients of a degree, and may carry one over its bound.
         gaussians.clamp_coefficients();
     }
 }
@@ -186,6 +194,7 @@ impl FromStr for Axes {
     /// Parses the name of a preset, or the nine numbers of the matrix, row by row, separated by
     /// commas or spaces.
     fn from_str(text: &str) -> Result<Self, IngestError> {
+        // Presets are orthonormal, so that this never fails.
         if let Some((_, _, rows)) = PRESETS.iter().find(|(name, ..)| *name == text) {
             return Self::from_rows(*rows);
         }

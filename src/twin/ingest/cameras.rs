@@ -158,6 +158,7 @@ const REFUSED_FIELDS: [&str; 10] = [
 /// Names the camera and the field at fault.
 pub fn read(path: &Path) -> Result<Vec<ListedCamera>, CamerasError> {
     let text = file::read_whole(path, limits::CAMERA_LIST_BYTES)?;
+    // JSON Lines and one object both begin with a brace, and a list with a bracket.
     let one_or_many = match text.trim_ascii_start().first() {
         Some(b'{') => serde_json::Deserializer::from_slice(&text).into_iter().collect(),
         _ => serde_json::from_slice(&text),
@@ -169,6 +170,7 @@ pub fn read(path: &Path) -> Result<Vec<ListedCamera>, CamerasError> {
     let mut cameras = Vec::with_capacity(entries.len());
     let mut names = BTreeSet::new();
     for (index, entry) in entries.into_iter().enumerate() {
+        // Names become names of files, so that separators, spaces and hidden files are refused.
         let allowed = |c: char| c.is_ascii_alphanumeric() || "._-".contains(c);
         let usable = (1..=MAX_NAME_BYTES).contains(&entry.name.len())
             && entry.name.chars().all(allowed)
@@ -191,6 +193,8 @@ fn check(entry: Entry) -> Result<ListedCamera, CamerasError> {
     if let Some(stops) = refused_stops(exposure_stops) {
         return Err(CamerasError::Stops { name, stops });
     }
+    // These describe a motion during the image, or a part of a vehicle: neither exists without a
+    // rig.
     let of_rigs = [
         ("shutter", entry.shutter.is_some()),
         ("exposure", entry.exposure.is_some()),
@@ -199,6 +203,7 @@ fn check(entry: Entry) -> Result<ListedCamera, CamerasError> {
     if let Some((field, _)) = of_rigs.into_iter().find(|(_, given)| *given) {
         return Err(CamerasError::RigCameraField { name, field });
     }
+    // To ignore a lens would render another picture without a word.
     if let Some(field) = REFUSED_FIELDS.into_iter().find(|field| entry.others.contains_key(*field))
     {
         return Err(CamerasError::OtherLens { name, field });
@@ -210,6 +215,7 @@ fn check(entry: Entry) -> Result<ListedCamera, CamerasError> {
     // glam's columns are the file's rows, so this matrix is the inverse: the rotation of
     // world_from_camera.
     let rotation = DMat3::from_cols_array_2d(&entry.rotation);
+    // R Rᵀ - I is zero for a rotation. 1e-4 leaves room for entries that were rounded.
     let off = (rotation * rotation.transpose() - DMat3::IDENTITY).to_cols_array();
     let error = off.iter().fold(0.0, |most: f64, e| most.max(e.abs()));
     let determinant = rotation.determinant();
@@ -220,11 +226,13 @@ fn check(entry: Entry) -> Result<ListedCamera, CamerasError> {
     if !is_orthonormal {
         return Err(CamerasError::Rotation { name, error, determinant });
     }
+    // Rounded entries make a quaternion of nearly length 1, and poses need exactly 1.
     let rotation = DQuat::from_mat3(&rotation).normalize();
     let q = [rotation.w, rotation.x, rotation.y, rotation.z];
     let pose = Pose::checked(position, q);
     let world_from_camera =
         pose.map_err(|cause| CamerasError::Pose { name: name.clone(), cause })?;
+    // A side that does not fit is clamped, and the check below refuses it with its name.
     let size_px = [width, height].map(|side| u32::try_from(side).unwrap_or(u32::MAX));
     let intrinsics = Intrinsics {
         size_px,
@@ -234,7 +242,9 @@ fn check(entry: Entry) -> Result<ListedCamera, CamerasError> {
         windshield,
         native_size_px: None,
     };
-    let camera = intrinsics.camera().and_then(|camera| camera.check().map(|()| camera));
-    let camera = camera.map_err(|cause| CamerasError::Camera { name: name.clone(), cause })?;
+    let camera = intrinsics
+        .camera()
+        .and_then(|camera| camera.check().map(|()| camera))
+        .map_err(|cause| CamerasError::Camera { name: name.clone(), cause })?;
     Ok(ListedCamera { name, camera, world_from_camera, near, image, mask, time_us, exposure_stops })
 }

@@ -42,6 +42,7 @@ pub(super) fn read(
         held: file_bytes.into(),
         content,
     };
+    // Before allocating one entry per section: their number is untrusted.
     if headers_bytes > file_bytes.into() {
         return Err(size(headers_bytes, format!("headers of {} sections", header.sections)));
     }
@@ -86,13 +87,14 @@ impl Header {
             return Err(bad("bytes 20 to 21", format!("level {level}; 0, 1 and 2 are read")));
         }
         let [least, most] = [36, 40].map(|at| f32::from_bits(u32_at(&bytes, at)));
+        // Zero stands for the default: a file need not give a range.
         let or = |value: f32, default: f32| if value == 0.0 { default } else { value };
         let sh_range = [or(least, -SH_RANGE), or(most, SH_RANGE)];
         Ok(Self { sections: u32_at(&bytes, 4), count: u32_at(&bytes, 16), level, sh_range })
     }
 }
 
-/// A section's header.
+/// The header of a section: a run of Gaussians of one SH degree.
 struct Section {
     index: u32,
     count: u32,
@@ -132,12 +134,15 @@ impl Section {
             full_buckets: u32_at(&bytes, 32),
             partial_buckets: u32_at(&bytes, 36),
             sh_degree,
+            // 44 = 12 + 12 + 16 + 4 bytes of position, scales, rotation and colour; 24 = 6 + 6 + 8
+            // + 4.
             record_bytes: match header.level {
                 0 => 44 + 4 * values,
                 1 => 24 + 2 * values,
                 _ => 24 + values,
             },
         };
+        // The rest of the room is unused records, whose number is computed by subtraction.
         if section.count > section.max_count {
             let count = section.count;
             let most = section.max_count;
@@ -175,6 +180,8 @@ impl Section {
         }
         let mut gaussians = Gaussians::with_capacity(self.sh_degree, self.count as usize);
         let mut record = vec![0; self.record_bytes];
+        // Full buckets come first and hold `bucket_size` Gaussians each; the sizes of the others
+        // are listed.
         let full = std::iter::repeat_n(self.bucket_size, self.full_buckets as usize);
         let sizes = full.chain(partial_sizes).enumerate();
         let mut buckets =
@@ -203,6 +210,7 @@ impl Section {
             g.means_m.push([0, 4, 8].map(|at| single(at).into()));
             ([12, 16, 20].map(single), [24, 28, 32, 36].map(single), 40)
         } else {
+            // Steps count from -range to +range over one block, so half a block has `range` steps.
             let metres = f64::from(self.block_m) / 2.0 / f64::from(self.range);
             g.means_m.push(std::array::from_fn(|axis| {
                 let steps = f64::from(u16_at(record, 2 * axis)) - f64::from(self.range);

@@ -114,10 +114,13 @@ pub fn read_limited(
     progress: Progress<'_>,
 ) -> Result<ReadScene, IngestError> {
     let (file, file_bytes) = file::open(path)?;
+    // The hash is computed of the bytes as they pass, so that it is of what was read even if the
+    // file changes.
     let mut input =
         BufReader::with_capacity(BUFFER_BYTES, HashReader::new(file, limits.stop.clone()));
     let mut reading = Reading::new(limits);
     let reader = &mut reading;
+    // Only looks into the buffer: the reader of the format sees the file from its first byte.
     let format = Format::detect(input.fill_buf()?)?;
     format.check_level(limits.level)?;
     let gaussians = match format {
@@ -153,6 +156,7 @@ pub fn read_limited(
             archive::read(bytes, UnpackBudget::new(limits), reader)?
         }
     };
+    // Readers may stop before the end of the file, and the hash is of all of it.
     io::copy(&mut input, &mut io::sink())?;
     let hash = input.into_inner().finish();
     let notes = check_dropped(&gaussians, reading)?;
@@ -196,6 +200,7 @@ fn read_parts(
     mut reading: Reading,
     format: MultiFileFormat,
 ) -> Result<ReadScene, IngestError> {
+    // JSON is parsed as a whole, so its limit is lower than that of a file with buffers of numbers.
     let limit_bytes = match format {
         MultiFileFormat::Json => SCENE_JSON_BYTES,
         MultiFileFormat::Glb => SCENE_PART_BYTES,
@@ -204,6 +209,7 @@ fn read_parts(
     parts.add(first.len() as u64, input.into_inner().finish());
     let gaussians = match format {
         MultiFileFormat::Glb => gltf::read_glb(&first, &mut parts, &mut reading)?,
+        // glTF and SOG are both JSON, and their keys tell them apart.
         MultiFileFormat::Json if gltf::is_likely(&first) => {
             gltf::read(&first, None, &mut parts, &mut reading)?
         }

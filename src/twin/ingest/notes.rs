@@ -71,6 +71,7 @@ impl FileNotes {
         if is_new && self.warnings.len() < MAX_WARNINGS {
             self.warnings.push(warning);
         } else if is_new && self.warnings.len() == MAX_WARNINGS {
+            // The last entry says that there were more. After it, nothing is added.
             self.warnings.push("further parts are not read".to_owned());
         }
     }

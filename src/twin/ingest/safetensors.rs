@@ -51,9 +51,11 @@ fn read_tensors(
 ) -> Result<Gaussians, IngestError> {
     let coefficients = sh::coefficients(plan.sh_degree);
     let mut gaussians = Gaussians::with_capacity(plan.sh_degree, plan.count);
+    // Colours may come in two tensors, which each fill a part of every row: the rows exist before.
     gaussians.sh.resize(3 * coefficients * plan.count, 0.0);
     let mut body = Body { input, body_start, done: body_start, file_bytes, progress };
 
+    // The file is read once from front to back, so tensors are taken in the order of their bytes.
     plan.tensors.sort_by_key(|(_, tensor)| tensor.data_offsets);
     for (column, tensor) in plan.tensors {
         let g = &mut gaussians;
@@ -68,6 +70,8 @@ fn read_tensors(
                 let of_tensor = tensor.shape[1];
                 let mut row = 0;
                 body.rows(tensor, |rgb: [f64; 3]| {
+                    // Row r of the tensor has coefficient r mod K of Gaussian r / K, for K
+                    // coefficients a Gaussian.
                     let at = 3 * (row / of_tensor * coefficients + first + row % of_tensor);
                     g.sh[at..at + 3].copy_from_slice(&rgb.map(|c| c as f32));
                     row += 1;
@@ -88,6 +92,7 @@ pub(super) fn read_tracked(
 ) -> Result<(Gaussians, Vec<i64>), IngestError> {
     // Tensors may be in any order, so the whole file is held, as that of a scene in parts.
     let mut bytes = Vec::new();
+    // The limit bounds the memory. A longer file fails below, as one that was cut.
     input.take(limits::SCENE_PART_BYTES).read_to_end(&mut bytes)?;
     let mut file = &bytes[..];
     let (metadata, body_start) = read_metadata(&mut file, file_bytes)?;
@@ -99,8 +104,9 @@ pub(super) fn read_tracked(
     let place = "tensor point_ids";
     let info = metadata.info(POINT_IDS).ok_or_else(|| bad(place, "is missing".into()))?;
     let (start, end) = info.data_offsets;
-    let body = bytes.get(body_start as usize + start..body_start as usize + end);
-    let body = body.ok_or_else(|| bad(place, "reaches beyond the file".into()))?;
+    let body = bytes
+        .get(body_start as usize + start..body_start as usize + end)
+        .ok_or_else(|| bad(place, "reaches beyond the file".into()))?;
     let ids: Vec<i64> = match info.dtype {
         Dtype::I32 => body.as_chunks().0.iter().map(|id| i32::from_le_bytes(*id).into()).collect(),
         Dtype::I64 => body.as_chunks().0.iter().map(|id| i64::from_le_bytes(*id)).collect(),
@@ -120,10 +126,12 @@ fn read_metadata(input: &mut impl Read, file_bytes: u64) -> Result<(Metadata, u6
     input.read_exact(&mut length)?;
     let length = u64::from_le_bytes(length);
     let limit = limits::SAFETENSORS_HEADER_BYTES as u64;
+    // Checked before allocating, because the length is untrusted.
     if length > limit {
         return Err(bad("length", format!("{length} bytes; at most {limit} are read")));
     }
     let mut header = vec![0; length as usize];
+    // The only cause besides a broken disk is a file that ends within its header.
     if input.read_exact(&mut header).is_err() {
         return Err(bad("length", format!("{length} bytes do not fit a file of {file_bytes}")));
     }
@@ -197,11 +205,13 @@ impl<'a> ReadPlan<'a> {
         };
         let means = shaped("means", &[None, Some(3)])?;
         let n = Some(means.shape[0]);
+        // With both, sh0 is read, and coeffs is named among the tensors that are skipped.
         let one_tensor = metadata.info("sh0").is_none() && metadata.info("coeffs").is_some();
         let colours = if one_tensor {
             vec![shaped("coeffs", &[n, None, Some(3)])?]
         } else {
             let mut colours = vec![shaped("sh0", &[n, Some(1), Some(3)])?];
+            // Without shN the scene is of degree 0.
             if metadata.info("shN").is_some() {
                 colours.push(shaped("shN", &[n, None, Some(3)])?);
             }
@@ -209,13 +219,14 @@ impl<'a> ReadPlan<'a> {
         };
         // Saturating, because a shape with a zero may have any other dimension.
         let coefficients = colours.iter().fold(0, |sum: usize, c| sum.saturating_add(c.shape[1]));
-        let sh_degree = (0..=sh::MAX_DEGREE).find(|&d| sh::coefficients(d) == coefficients);
-        let sh_degree = sh_degree.ok_or_else(|| {
-            let (name, before) = if one_tensor { ("coeffs", 0) } else { ("shN", 1) };
-            let allowed = [1, 4, 9, 16].map(|k: usize| (k - before).to_string()).join(", ");
-            let reason = format!("has {} coefficients, not {allowed}", coefficients - before);
-            bad(&format!("tensor {name}"), reason)
-        })?;
+        let sh_degree = (0..=sh::MAX_DEGREE)
+            .find(|&d| sh::coefficients(d) == coefficients)
+            .ok_or_else(|| {
+                let (name, before) = if one_tensor { ("coeffs", 0) } else { ("shN", 1) };
+                let allowed = [1, 4, 9, 16].map(|k: usize| (k - before).to_string()).join(", ");
+                let reason = format!("has {} coefficients, not {allowed}", coefficients - before);
+                bad(&format!("tensor {name}"), reason)
+            })?;
         let mut tensors = vec![
             (Column::Means, means),
             (Column::Quats, shaped("quats", &[n, Some(4)])?),
@@ -235,6 +246,7 @@ impl<'a> ReadPlan<'a> {
     fn skipped(&self, metadata: &Metadata) -> Vec<String> {
         let is_read = |name: &str| {
             let info = metadata.info(name);
+            // By identity and not by name: the plan holds references into the same metadata.
             info.is_some_and(|info| self.tensors.iter().any(|(_, read)| std::ptr::eq(*read, info)))
         };
         let is_skipped =
@@ -262,6 +274,7 @@ impl<R: Read> Body<'_, R> {
         mut take: impl FnMut([f64; N]),
     ) -> Result<(), IngestError> {
         let (start, end) = tensor.data_offsets;
+        // The input may be hashed as it is read, so that what lies between is read and dropped.
         let between = (self.body_start + start as u64).saturating_sub(self.done);
         self.done += io::copy(&mut (&mut self.input).take(between), &mut io::sink())?;
         let is_f64 = tensor.dtype == Dtype::F64;
@@ -299,9 +312,11 @@ impl<R: Read> Body<'_, R> {
     /// Reads a tensor of classes.
     fn classes(&mut self, tensor: &TensorInfo) -> Result<Vec<SemanticClass>, IngestError> {
         let mut all = Vec::new();
+        // `rows` cannot be stopped, so it goes on after a fault. The first one is reported.
         let mut faulty = None;
         self.rows(tensor, |[value]| {
             all.push(classes::class(value).unwrap_or_else(|reason| {
+                // `all` does not yet hold this row, so its length is the row's index.
                 faulty.get_or_insert((all.len(), reason));
                 SemanticClass::Unlabelled
             }));

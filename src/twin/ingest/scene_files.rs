@@ -89,6 +89,7 @@ impl<'a> PartFiles<'a> {
         self.hashes.push(hash);
         self.read_bytes += bytes;
         self.budget.read(bytes);
+        // How many files follow is unknown, so that progress has no total.
         (self.progress)(self.read_bytes, self.read_bytes);
     }
 

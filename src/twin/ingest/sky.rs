@@ -52,6 +52,7 @@ pub fn read(path: &Path, image: Option<u32>) -> Result<SkyFile, IngestError> {
 /// # Errors
 /// As [`read`].
 pub fn read_bytes(bytes: &[u8], image: Option<u32>) -> Result<SkyFile, IngestError> {
+    // safetensors has a length in 8 bytes and then JSON. In a PNG this byte is 0.
     if bytes.get(8) == Some(&b'{') {
         let Weights { layers, appearances } = Weights::read(bytes)?;
         let bytes = stored_network(&layers, &appearances)?;
@@ -69,6 +70,7 @@ pub fn decode(bytes: &[u8], image: Option<u32>) -> Result<SkyModel, IngestError>
         let Weights { layers, appearances } = Weights::read(bytes)?;
         return Ok(SkyModel::network(Network::new(layers, appearances.row(image)?)?));
     }
+    // Only a network has appearances. An index that has no effect is an error of the caller.
     if let Some(image) = image {
         return Err(SkyError::Image { image, count: 0 }.into());
     }
@@ -123,6 +125,8 @@ impl Appearances {
             Some(image) if (image as usize) < *count => Ok(row(image as usize).to_vec()),
             Some(image) => Err(SkyError::Image { image, count: *count }),
             None => {
+                // The mean is summed in 64 bits, in the order of the rows, so that it is the same
+                // everywhere.
                 let sum = |k: usize| (0..*count).map(|i| f64::from(row(i)[k])).sum::<f64>();
                 Ok((0..*length).map(|k| (sum(k) / (*count).max(1) as f64) as f32).collect())
             }
@@ -155,6 +159,7 @@ fn floats(
 }
 
 fn stored_network(layers: &[Layer; 3], appearances: &Appearances) -> Result<Vec<u8>, IngestError> {
+    // The twin stores F32 whatever the file had, so that each version decodes by one path.
     let bytes = |values: &[f32]| values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>();
     let mut tensors: Vec<(String, Vec<usize>, Vec<u8>)> = Vec::new();
     for (number, layer) in layers.iter().enumerate() {
@@ -164,6 +169,7 @@ fn stored_network(layers: &[Layer; 3], appearances: &Appearances) -> Result<Vec<
         tensors.push((name("bias"), vec![bias.len()], bytes(bias)));
     }
     let Appearances { count, length, values } = appearances;
+    // Without an embedding the tensor is left out, which `Weights::read` takes for no appearances.
     if *length > 0 {
         tensors.push((APPEARANCES.to_owned(), vec![*count, *length], bytes(values)));
     }
@@ -195,6 +201,7 @@ fn picture(bytes: &[u8]) -> Result<RgbImage, IngestError> {
     if !is_read {
         return Err(bad("start", "it is not a safetensors file, a PNG, or a JPEG".to_owned()));
     }
+    // A few bytes may claim a picture of many gigabytes, so the decoder's memory is bounded.
     let mut limits = image::Limits::default();
     limits.max_alloc = Some(limits::SKY_IMAGE_BYTES);
     reader.limits(limits);
@@ -207,6 +214,7 @@ fn faces(picture: &RgbImage) -> Result<RgbImage, IngestError> {
     // The position of each face, in faces from the left and the top.
     let (side, position): (u32, [[u32; 2]; FACES]) = match (width, height) {
         (w, h) if w == 2 * h => return panorama(picture),
+        // A strip from top to bottom is the stored form already.
         (w, h) if h == 6 * w => return Ok(picture.clone()),
         (w, h) if w == 6 * h => (h, [[0, 0], [1, 0], [2, 0], [3, 0], [4, 0], [5, 0]]),
         (w, h) if w % 4 == 0 && 4 * h == 3 * w => {
@@ -223,6 +231,8 @@ fn faces(picture: &RgbImage) -> Result<RgbImage, IngestError> {
             return Err(bad("image", reason));
         }
     };
+    // A side is at least 1: the decoder refuses pictures without pixels, and the cases above divide
+    // evenly.
     let last = side - 1;
     Ok(RgbImage::from_fn(side, FACES as u32 * side, |column, y| {
         let face = (y / side) as usize;
@@ -247,8 +257,10 @@ fn panorama(picture: &RgbImage) -> Result<RgbImage, IngestError> {
     }
     let colour = |away: DVec3| {
         let away = away.normalize();
+        // Azimuth 0 is ahead, in the middle of the panorama. Pixel k has its middle at k + 0.5.
         let azimuth = away.x.atan2(away.z) / TAU + 0.5;
         let u = azimuth * f64::from(width) - 0.5;
+        // Rows end at the poles and are clamped; columns wrap around.
         let v = (away.y.clamp(-1.0, 1.0).acos() / PI * f64::from(height) - 0.5)
             .clamp(0.0, f64::from(height - 1));
         // Bilinear interpolation.
@@ -275,8 +287,7 @@ fn folder(path: &Path) -> Result<RgbImage, IngestError> {
     let mut strip: Option<RgbImage> = None;
     for (face, name) in (0..).zip(["px", "nx", "py", "ny", "pz", "nz"]) {
         let candidates = ["png", "jpg", "jpeg"].map(|kind| path.join(format!("{name}.{kind}")));
-        let found = candidates.iter().find(|candidate| candidate.exists());
-        let found = found.ok_or_else(|| {
+        let found = candidates.iter().find(|candidate| candidate.exists()).ok_or_else(|| {
             bad(name, format!("there is no {name}.png or {name}.jpg in {}", path.display()))
         })?;
         let part =
@@ -284,6 +295,7 @@ fn folder(path: &Path) -> Result<RgbImage, IngestError> {
         let bytes = file::read_whole(found, limits::SKY_FILE_BYTES).map_err(part)?;
         let picture = picture(&bytes)?;
         let side = strip.as_ref().map_or(picture.width(), RgbImage::width);
+        // The first face decides the side, because all six must be equal for a cube.
         if picture.dimensions() != (side, side) {
             let (width, height) = picture.dimensions();
             return Err(bad(name, format!("is {width} x {height} pixels, not {side} x {side}")));

@@ -34,6 +34,7 @@ pub(super) fn read(
     file_bytes: u64,
     reading: &mut Reading,
 ) -> Result<Gaussians, IngestError> {
+    // Rounded up, so that a file with a part of a record holds less than it promises.
     let count = file_bytes.div_ceil(RECORD_BYTES as u64);
     let promised = u128::from(count) * RECORD_BYTES as u128;
     if promised != u128::from(file_bytes) {
@@ -64,7 +65,7 @@ pub(super) fn read(
     reading.accept(gaussians, &Field::plain_name)
 }
 
-/// Position and scales.
+/// Position and scales of a record, each as x, y, z in metres.
 fn numbers(record: &[u8; RECORD_BYTES]) -> [[f32; 3]; 2] {
     let words = record.as_chunks::<4>().0;
     [0, 3].map(|first| std::array::from_fn(|i| f32::from_le_bytes(words[first + i])))

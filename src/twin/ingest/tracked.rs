@@ -39,6 +39,7 @@ pub fn read_tracked(
         }
         _ => Vec::new(),
     };
+    // The hash is of all bytes, and a reader may stop before the end.
     std::io::copy(&mut input, &mut std::io::sink())?;
     if found.is_empty() {
         return Err(IngestError::Body {

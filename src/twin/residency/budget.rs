@@ -72,9 +72,14 @@ pub(super) struct Claim {
 
 impl Budget {
     pub(super) fn new(limit_bytes: u64) -> Self {
-        let versions = BTreeMap::new();
-        let (stages, beside) = (BTreeMap::new(), BTreeMap::new());
-        Self { limit_bytes, versions, stages, beside, large: 0, images_bytes: 0 }
+        Self {
+            limit_bytes,
+            versions: BTreeMap::new(),
+            stages: BTreeMap::new(),
+            beside: BTreeMap::new(),
+            large: 0,
+            images_bytes: 0,
+        }
     }
 
     /// Reserves memory.
@@ -117,6 +122,8 @@ impl Budget {
     /// # Errors
     /// As [`Budget::reserve`].
     pub(super) fn exchange(&mut self, old: &Claim, new: &Claim) -> Result<(), ResidencyError> {
+        // The old claim goes first, because both need not fit at the same time. The copy undoes
+        // that.
         let before = self.clone();
         self.release(old);
         self.reserve(new).inspect_err(|_| *self = before)

@@ -120,6 +120,7 @@ impl BlockIndex {
             sections.push(section);
             by_chunk.push(views.collect());
         });
+        // If all views draw the same sections, the renderer needs no selection by view.
         let all: ViewSet = (0..views).collect();
         let is_shared = by_chunk.iter().all(|&set| set == all);
         let selection = (!is_shared).then_some(Selection { views, by_chunk });
@@ -149,6 +150,8 @@ impl BlockIndex {
                 let is_near = reach_m.is_none_or(|reach_m| distance_m <= reach_m);
                 *drawn = is_near.then(|| coarsest_level(levels, *focal_px, distance_m, tau_px));
             }
+            // Level by level and not view by view, so that a section is seen once, with all of its
+            // views.
             for level in 0..levels.len() {
                 let draws = |(_, drawn): &(usize, &Option<usize>)| **drawn == Some(level);
                 let mut views = drawn.iter().enumerate().filter(draws).map(|(view, _)| view);
@@ -187,7 +190,7 @@ impl BlockIndex {
         }
     }
 
-    /// Number of blocks.
+    /// Number of blocks of all cells.
     pub(super) fn blocks(&self) -> usize {
         self.blocks.len()
     }

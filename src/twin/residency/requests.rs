@@ -197,6 +197,7 @@ impl<C> Requests<C> {
             // Touched in any case: that it will be needed soon keeps it from eviction, full queue
             // or not.
             self.table.touch(id, request);
+            // A full queue takes no more of a prefetch. Frames are queued in any case.
             if self.table.get(id).is_none() && self.queue.len() < limits::QUEUED_SECTIONS {
                 self.queue.insert(QueueKey { urgency, request, order, id }, section);
             }
@@ -217,6 +218,7 @@ impl<C> Requests<C> {
 
     pub(super) fn cancel_prefetch(&mut self, number: u64) {
         self.requests.remove(&number);
+        // The entries of a prefetch have these two urgencies.
         self.unqueue(Urgency::Imminent, number);
         self.unqueue(Urgency::Speculative, number);
     }
@@ -258,6 +260,7 @@ impl<C> Requests<C> {
 
     fn unqueue(&mut self, urgency: Urgency, request: u64) {
         let entries = self.queue.range(request_keys(urgency, request));
+        // Collected first, because the queue cannot change while a range of it is read.
         let keys: Vec<QueueKey> = entries.map(|(key, _)| *key).collect();
         keys.iter().for_each(|key| {
             self.queue.remove(key);
@@ -432,6 +435,7 @@ impl<C> Requests<C> {
                 sky: requested.sky.clone(),
             },
             waited_for: frame.waited_for,
+            // A frame that waited for no section did not wait, however long the call took.
             waited: match frame.waited_for {
                 0 => Duration::ZERO,
                 _ => frame.requested.elapsed(),
@@ -459,6 +463,7 @@ impl<C> Requests<C> {
         for number in self.table.waiters(id).to_vec() {
             let Some(request) = self.cancel_frame(number) else { continue };
             let Request { requested, frame: Some(frame), .. } = request else { continue };
+            // It is there, because the frame waits for it. The default only avoids a panic.
             let index = requested.ids.iter().position(|&other| other == id).unwrap_or(0);
             let SectionRef { chunk, section } = requested.sections[index];
             let manifest = &requested.version.manifest;

@@ -112,8 +112,10 @@ impl SceneBytes {
         frame: FrameBytes,
         mut change: impl FnMut(&mut Budget, &Claim) -> Result<(), ResidencyError>,
     ) -> Result<(Claim, bool), ResidencyError> {
+        // All views at once take less time, so that is tried first.
         let together = claim(resident, self.together, frame);
         let refused = change_budget(resident, |budget| change(budget, &together));
+        // Another error than a lack of room would be the same view by view.
         let (Err(ResidencyError::NoRoom { .. }), Some(bytes)) = (&refused, self.by_view) else {
             return refused.map(|()| (together, false));
         };
@@ -138,9 +140,12 @@ impl Reservation {
         let old = &self.claim;
         let exchange = |budget: &mut Budget, new: &Claim| budget.exchange(old, new);
         let (claim, is_by_view) = scenes.admit(&resident, frame, exchange)?;
+        // Counts changes to this way of drawing: a session that draws so already is not counted
+        // again.
         if is_by_view && !self.is_by_view {
             resident.shared.pager.count_by_camera();
         }
+        // Loads for the old version would take memory that the budget has given to others.
         self.prefetcher.end();
         self.claim = claim;
         self.is_by_view = is_by_view;
@@ -161,6 +166,8 @@ impl Reservation {
             && frame.beside <= beside
             && (is_large || !frame.is_large)
             && frame.images <= images;
+        // Each way of drawing is compared with its own needs. Frames that may not be split fit no
+        // reservation for one view.
         let needed = if self.is_by_view { scenes.by_view } else { Some(scenes.together) };
         frame_fits && needed.is_some_and(|needed| needed <= self.claim.bytes)
     }
@@ -226,6 +233,7 @@ impl Prefetcher {
                 }
             }
         }
+        // A prefetch draws nothing, so it need not know which view needs which section.
         let requested = self.resident.requested(SelectedSections { sections, selection: None });
         // The state is locked during the request, so that `end` cannot fall between the two and
         // leave a prefetch that is never cancelled.
@@ -254,6 +262,7 @@ impl Prefetcher {
 
 impl Drop for Prefetcher {
     fn drop(&mut self) {
+        // Does nothing if the reservation has ended it before.
         self.end();
     }
 }

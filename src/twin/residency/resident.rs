@@ -149,6 +149,7 @@ impl Resident {
             let _ = sender.send(pinned);
         });
         let request = self.request(viewpoints, profile, callback)?;
+        // The sender is dropped without an answer only if the pager has crashed.
         receiver.recv().unwrap_or_else(|_| Err(request.timeout_error()))
     }
 

@@ -165,6 +165,8 @@ impl SectionTable {
     pub(super) fn remove_waiter(&mut self, id: SlotId, frame: u64) {
         if let Some(frames) = self.waiters.get_mut(&id) {
             frames.retain(|&other| other != frame);
+            // Sections for which no frame waits have no entry, so that the map stays as small as
+            // the waiting frames.
             if frames.is_empty() {
                 self.waiters.remove(&id);
             }
@@ -227,6 +229,7 @@ impl SectionTable {
         let slot = &mut self.slots[id as usize];
         slot.state = State::Absent;
         self.held_bytes -= slot.bytes;
+        // Its last version may have been closed while it was being read.
         self.release_if_unused(id);
     }
 
@@ -296,6 +299,7 @@ impl SectionTable {
         slot.state = State::Absent;
         self.held_bytes -= slot.bytes;
         self.held_sections -= 1;
+        // Its last version may have been closed while it was in memory.
         self.release_if_unused(id);
     }
 

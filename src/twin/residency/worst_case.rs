@@ -32,6 +32,7 @@ impl RigExtent {
         let focal_px = viewpoints.iter().map(|viewpoint| viewpoint.focal_px);
         let from_origin_m =
             viewpoints.iter().map(|viewpoint| viewpoint.position_m.distance(origin_m));
+        // Without cameras all of these are 0.
         Self {
             views: viewpoints.len(),
             focal_px: focal_px.clone().fold(0.0, f64::max),

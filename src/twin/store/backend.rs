@@ -75,7 +75,7 @@ pub(super) trait ObjectBackend: Debug + Send + Sync {
     /// [`StoreError::Damaged`] if it is shorter or longer.
     fn check_present(&self, name: &str, hash: &str, bytes: u64) -> Result<(), StoreError>;
 
-    /// Begins a commit.
+    /// Begins a commit: what it stages is no part of the twin before it is published.
     fn begin_staging(&self, name: &str, commit: &str) -> Result<Box<dyn Staging>, StoreError>;
 
     /// Names of the twins with a commit that has begun and not ended: it runs, or it was killed.

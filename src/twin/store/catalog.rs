@@ -96,6 +96,7 @@ impl Catalog {
         let url = place.to_str().filter(|place| place.contains("://"));
         let dir = url.and_then(|url| url.strip_prefix("file://"));
         let catalog = match (url, dir) {
+            // A directory, with a directory's locks and without a disk cache.
             (_, Some(dir)) => Self::local(Path::new(dir)),
             (Some(url), None) => Self::remote(Remote::at(url, cache)?),
             (None, None) => Self::local(place),
@@ -154,6 +155,7 @@ impl Catalog {
 
     #[cfg(not(feature = "object-store"))]
     fn remote(remote: Remote) -> Self {
+        // Without the feature the type has no values, so that this is never called.
         match remote {}
     }
 

@@ -308,6 +308,7 @@ fn for_each_part(
         let capacity = record.part_bytes(sh_degree, here) + classes_bytes;
         decompressed(part, capacity, |raw| {
             let raw = raw.map_err(|error| format!("a part does not decompress: {error}"))?;
+            // A part that is shorter than its classes has no records, and decoding refuses it.
             let (records, classes) = raw.split_at(raw.len().saturating_sub(classes_bytes));
             visit(&Part { records, classes, sh_degree, record, count: here })
         })?;

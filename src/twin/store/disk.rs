@@ -95,7 +95,6 @@ pub trait Disk: Debug + Send + Sync {
 /// The kind of the entry at a path.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct FileInfo {
-    /// Size in bytes.
     pub bytes: u64,
     /// When it was last written, in microseconds since 1970.
     pub modified_us: i64,

@@ -329,8 +329,8 @@ fn overlap(cells: &[[i32; 2]], settings: &[&str]) -> String {
     let named = cells.iter().take(NAMED).map(|[x, y]| format!("({x}, {y})"));
     let mut said: Vec<String> = Vec::new();
     if !cells.is_empty() {
-        let more = cells.len().saturating_sub(NAMED);
-        let more = if more > 0 { format!(" and {more} more") } else { String::new() };
+        let unnamed = cells.len().saturating_sub(NAMED);
+        let more = if unnamed > 0 { format!(" and {unnamed} more") } else { String::new() };
         said.push(format!("cells {}{more}", named.collect::<Vec<_>>().join(" ")));
     }
     said.extend(settings.iter().map(|&setting| setting.to_owned()));

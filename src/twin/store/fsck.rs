@@ -187,6 +187,7 @@ impl Catalog {
                     }
                     match uncached.view_objects(&manifest) {
                         Ok(objects) => {
+                            // Images that several versions name are read once.
                             for object in objects.into_iter().filter(|one| !named.contains(one)) {
                                 let read = uncached.objects.read_start(name, &object, 0);
                                 if let Err(error) = read {
@@ -210,6 +211,7 @@ impl Catalog {
                     if let Err(error) = uncached.fill(&mut manifest) {
                         damaged.push(DamagedObject { object: table, error });
                     }
+                    // By hash: a chunk that several versions name is read once.
                     chunks.extend(manifest.chunks.into_iter().map(|c| (c.object.clone(), c)));
                 }
                 Err(error) => damaged.push(DamagedObject { object: hash, error }),

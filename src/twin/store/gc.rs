@@ -177,10 +177,12 @@ impl Catalog {
         for &number in &kept {
             named.extend(self.named_by(name, &self.record(name, number)?.manifest)?);
         }
+        // A grace period beyond this range never ends.
         let grace_us = i64::try_from(keep.grace.as_micros()).unwrap_or(i64::MAX);
         // If the clock jumped back, an age is negative, and the object is not old.
         let is_old = |since_us: i64| now_us.saturating_sub(since_us) >= grace_us;
         let mut found = self.objects.list_objects(name)?.whole()?;
+        // An entry that is no file is no object, and is left where it is.
         found.retain(|object| object.is_file && !named.contains(&object.hash));
         let is_removable = |object: &&ListedObject| {
             let noted_us = before.get(&object.hash).copied();
@@ -189,8 +191,8 @@ impl Catalog {
         };
         let removable = found.iter().filter(is_removable).map(|object| object.hash.clone());
         let mut plan = CollectionPlan { remove: removable.collect(), ..CollectionPlan::default() };
-        let others = numbers.into_iter();
-        let others = others.filter(|number| !kept.contains(number) && !gone.contains(number));
+        let others =
+            numbers.into_iter().filter(|number| !kept.contains(number) && !gone.contains(number));
         self.keep_whole_versions(name, others.collect(), &is_old, &mut plan)?;
         for object in &found {
             let noted_us = before.get(&object.hash).copied();
@@ -228,6 +230,8 @@ impl Catalog {
                 Err(StoreError::Damaged { .. }) => continue,
                 record => record?,
             };
+            // A young version stays even if its manifest was noted as that of an older one, as
+            // after a rollback.
             let stays = !plan.remove.contains(&record.manifest) || !is_old(record.created_us);
             // Versions that share a manifest, as after a rollback, are read once.
             if stays && !needed.contains(&record.manifest) {

@@ -46,6 +46,7 @@ impl Catalog {
         option: String,
     ) -> Result<Labelled, StoreError> {
         let manifest = &base.manifest;
+        // The inverse of each place is needed for every Gaussian.
         let places: Vec<(&CutPlace, Pose, SemanticClass)> = labels
             .places
             .iter()
@@ -57,6 +58,7 @@ impl Catalog {
         for chunk in &manifest.chunks {
             let near: Vec<_> =
                 places.iter().filter(|(place, ..)| place.is_near(&chunk.bounds)).collect();
+            // Only the ground reaches cells that no box is near.
             if near.is_empty() && labels.ground.is_none() {
                 continue;
             }
@@ -79,6 +81,8 @@ impl Catalog {
                 all.classes.take().unwrap_or_else(|| vec![SemanticClass::Unlabelled; all.len()]);
             let classes = given.iter().zip(own).map(|(given, own)| given.unwrap_or(own));
             all.classes = Some(classes.collect());
+            // A commit replaces whole cells, so that also the Gaussians without a new class are put
+            // again.
             cells.insert(chunk.cell);
             changed.append(&all);
         }

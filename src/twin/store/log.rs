@@ -60,6 +60,7 @@ pub enum CommitKind {
 pub(super) struct LogRecord {
     pub(super) manifest: String,
     pub(super) created_us: i64,
+    // Versions from before commits had an identity lack it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(super) commit: Option<String>,
     #[serde(default, skip_serializing_if = "Option::is_none")]

@@ -86,11 +86,14 @@ impl<'a> CellPacker<'a> {
         only: Option<&BTreeSet<[i32; 2]>>,
     ) -> Self {
         let Partition { mut cells, order } = Partition::new(&gaussians.means_m);
+        // `order` keeps the indices of all cells, because the runs of those that stay are ranges of
+        // it.
         cells.retain(|run| only.is_none_or(|only| only.contains(&run.cell)));
         let sh_degree = gaussians.sh_degree;
         let has_classes = gaussians.classes.is_some();
         let gaussians = match gaussians {
             Cow::Borrowed(gaussians) => Source::Kept(gaussians, order),
+            // Split into blocks at once, so that the memory of each is freed as it is packed.
             Cow::Owned(gaussians) => Source::Consumed(by_block(gaussians, &cells, &order)),
         };
         Self { sh_degree, has_classes, storage, cells, gaussians }
@@ -128,15 +131,15 @@ impl<'a> CellPacker<'a> {
             rest = after;
 
             // The blocks of all cells of the batch, in parallel.
-            let packed = self.pack_blocks(batch);
-            let packed = packed.map_err(StoreError::io("compress for", staging.dir()))?;
+            let packed =
+                self.pack_blocks(batch).map_err(StoreError::io("compress for", staging.dir()))?;
 
             // Their objects, one after the other.
-            let mut packed = packed.into_iter();
+            let mut results = packed.into_iter();
             for cell in batch {
                 let mut sections = Vec::new();
                 // The results are in the order of `blocks`, cell by cell.
-                for (block, lost) in packed.by_ref().take(cell.blocks.len()) {
+                for (block, lost) in results.by_ref().take(cell.blocks.len()) {
                     sections.extend(block);
                     clamped.merge(&lost);
                 }
@@ -161,6 +164,8 @@ impl<'a> CellPacker<'a> {
                 runs.clone().map(kept).collect()
             }
             Source::Consumed(blocks) => {
+                // Batches come in the order of the blocks, so that those of this one are at the
+                // front.
                 blocks.drain(..runs.clone().count()).map(BlockParts::Consumed).collect()
             }
         };
@@ -183,6 +188,8 @@ impl<'a> CellPacker<'a> {
                 small.push(block);
                 continue;
             }
+            // The small blocks before it go first, so that the results stay in the order of the
+            // blocks.
             pack_small(&mut small, &mut packed)?;
             packed.push(block.pack(sh_degree, storage)?);
         }
@@ -268,6 +275,7 @@ impl BlockToPack<'_> {
                     }
                     classes.extend(part.classes.unwrap_or_default());
                 }
+                // All parts have classes or none has, as the scene.
                 let has_classes = !classes.is_empty();
                 full.with_classes(has_classes.then_some(classes))
             }
@@ -293,6 +301,7 @@ fn by_block(gaussians: Gaussians, cells: &[CellRun], order: &[u32]) -> VecDeque<
     if let Some(classes) = classes {
         sort_column(&mut parts, &indices, classes, |part| part.classes.insert(Vec::new()));
     }
+    // Unlike the other columns, this one has many values for each Gaussian.
     let stride = 3 * sh::coefficients(sh_degree);
     for (part, indices) in parts.iter_mut().zip(&indices) {
         part.sh.reserve_exact(stride * indices.len());
@@ -301,6 +310,7 @@ fn by_block(gaussians: Gaussians, cells: &[CellRun], order: &[u32]) -> VecDeque<
         }
     }
     let mut parts = parts.into_iter();
+    // `indices` has the parts of each run one after the other, in the order of the runs.
     let of_run =
         |run: &&Range<usize>| parts.by_ref().take(run.len().div_ceil(PART_GAUSSIANS)).collect();
     runs.iter().map(of_run).collect()

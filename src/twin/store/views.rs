@@ -118,6 +118,7 @@ pub(super) fn aligned(views: &[RecordedView], alignment: &Alignment) -> Vec<Reco
     // The stored image stays; only the place from which it was taken is in other axes.
     let aligned = |view: &RecordedView| RecordedView {
         world_from_camera: alignment.pose(&view.world_from_camera),
+        // A station is a length along a drive: only the scale changes it.
         station_m: alignment.metres_per_unit * view.station_m,
         ..view.clone()
     };

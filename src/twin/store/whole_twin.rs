@@ -35,17 +35,20 @@ impl Catalog {
         let gone = self.collected(from)?;
         let mut last = None;
         for entry in self.versions(from)? {
+            // Its objects are removed, so that there is nothing to copy.
             if gone.contains(&entry.number) {
                 continue;
             }
             let version = self.version(from, Some(entry.number))?;
             let (commit, settings) = self.begin_copy(&version, entry.kind, to)?;
+            // The first copy makes the twin. Each further one is based on the one before it.
             let copied = match last {
                 None => commit.create(settings)?,
                 Some(_) => commit.replace(last, settings)?,
             };
             last = Some(copied.number);
         }
+        // Last, so that a copy that fails leaves the old twin whole.
         self.remove(from)?;
         self.version(to, None)
     }
@@ -58,6 +61,7 @@ impl Catalog {
     /// removed; or what cannot be removed.
     pub fn remove(&self, name: &str) -> Result<(), StoreError> {
         check_name(name)?;
+        // Only for the error of a twin that does not exist.
         self.latest(name)?;
         self.check_unused(name)?;
         self.objects.remove_twin(name, &mut || {
@@ -92,6 +96,7 @@ impl Catalog {
         let manifest = &version.manifest;
         let storage = StorageOptions { record: manifest.record, levels: manifest.has_levels() };
         let mut commit = self.begin(to, kind, storage)?;
+        // An object longer than the manifest says is damaged, and is not read further.
         let read = |hash: &str, bytes: u64| self.objects.read_object(&manifest.twin, hash, bytes);
         commit.put_chunks(manifest, &mut |chunk| read(&chunk.object, chunk.bytes))?;
         if let Some(sky) = &manifest.sky {

@@ -28,7 +28,6 @@ impl FrameCost {
     }
 }
 
-/// Frames that wait.
 #[derive(Debug)]
 pub(super) struct FairQueue<T> {
     /// By finish tag, and then in order of arrival.
@@ -57,7 +56,6 @@ impl<T> FairQueue<T> {
         self.waiting.len()
     }
 
-    /// Adds a frame.
     pub(super) fn push(&mut self, cost: FrameCost, item: T) {
         // Without an entry its last finish is not later than the virtual time, so that 0 does as
         // well.

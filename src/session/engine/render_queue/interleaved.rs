@@ -89,9 +89,11 @@ impl Simulation {
         if self.waiting[session].is_some() || self.is_closed {
             return;
         }
+        // A third are large, so that frames wait for the main lane and small ones overtake them.
         let is_large = self.random.below(3) == 0;
         let samples = if is_large { 2 * limits::LARGE_SAMPLES } else { 100 };
         let cost = FrameCost { session: session as u64, samples };
+        // A large frame takes 3 ms: some deadlines are too early for it, and most are not.
         let deadline = self.now + Duration::from_millis(1 + self.random.below(40) as u64);
         let number = self.asked;
         self.asked += 1;
@@ -129,6 +131,8 @@ impl Simulation {
                 self.threads[thread].1 = Doing::Awake;
             }
             Doing::Awake | Doing::Asleep(_) => {
+                // A thread that still sleeps has returned above, so that this one is awake or was
+                // woken.
                 self.threads[thread].1 = Doing::Awake;
                 self.look(thread, lane);
             }
@@ -183,7 +187,9 @@ impl Simulation {
 
 #[test]
 fn no_order_of_threads_loses_a_frame() {
-    let [mut rendered, mut frames, mut dropped] = [0, 0, 0];
+    let mut rendered = 0;
+    let mut frames = 0;
+    let mut dropped = 0;
     for seed in 0..ORDERS {
         let mut simulation = Simulation::new(seed);
         // The queue of every other order is closed, at any time.
@@ -216,6 +222,7 @@ fn no_order_of_threads_loses_a_frame() {
         rendered += simulation.answered.values().filter(|&&is_rendered| is_rendered).count();
         frames += simulation.answered.len();
     }
+    // Guards against a simulation in which hardly anything is rendered.
     assert!(rendered > frames / 2, "{rendered} of {frames} frames were rendered");
     assert!(dropped > 100, "{dropped} frames waited at the end");
 }

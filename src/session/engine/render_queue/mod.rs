@@ -508,8 +508,8 @@ mod tests {
     /// Twelve sessions with large frames of 100 ms, and one with small frames of 1 ms.
     #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
     async fn small_frames_do_not_wait_for_large_ones() {
-        let queue = RenderQueue::start(Arc::new(IdleBackend { frames_in_flight: 1 })).unwrap();
-        let queue = Arc::new(queue);
+        let backend = Arc::new(IdleBackend { frames_in_flight: 1 });
+        let queue = Arc::new(RenderQueue::start(backend).unwrap());
         let end = Instant::now() + Duration::from_secs(2);
         let sleeping = |cost: FrameCost, time: Duration| {
             let queue = queue.clone();
@@ -523,8 +523,8 @@ mod tests {
                 steps
             }
         };
-        let all = (1..=12).map(|session| sleeping(large(session), Duration::from_millis(100)));
-        let all = futures_util::future::join_all(all);
+        let each = (1..=12).map(|session| sleeping(large(session), Duration::from_millis(100)));
+        let all = futures_util::future::join_all(each);
         let small = sleeping(SMALL, Duration::from_millis(1));
         let (large_steps, small_steps) = tokio::join!(all, small);
         // Alone, large frames would be 20, and the last of each session ends after the end.

@@ -191,6 +191,7 @@ impl ObservationBuilder {
         // At most 256 images: to compare all pairs is cheap.
         let place = |image: &ShownImage| {
             let key = |one: &ShownImage| [one.info.pose, one.info.camera];
+            // Pose and camera are unique, so that the number of smaller ones is the place.
             shown.iter().filter(|other| key(other) < key(image)).count()
         };
         let placed: Vec<(usize, &ShownImage)> =
@@ -240,6 +241,7 @@ impl ObservationBuilder {
         history: &mut FrameHistory,
         tensors: &mut TensorList,
     ) -> Result<Vec<PastImageInfo>, SessionError> {
+        // Without a capture there is no time, and nothing that could be kept.
         let Some(now_us) = self.captures.last().map(|capture| capture.due_us) else {
             return Ok(Vec::new());
         };

@@ -200,8 +200,10 @@ impl ObservationBuilder {
                 let opacity = target.opacity.as_deref().unwrap_or_default();
                 coverage.trust(&capture.world_from_rig, &frame.views[index], opacity)
             });
-            let repair = filter.as_ref().zip(trust);
-            let repair = repair.map(|(filter, trust)| filter.finished(index, trust.value, target));
+            let repair = filter
+                .as_ref()
+                .zip(trust)
+                .map(|(filter, trust)| filter.finished(index, trust.value, target));
             let mut image = match &repair {
                 // Encoding waits for the repair; the hash of the rendered pixels is needed in any
                 // case.

@@ -90,6 +90,7 @@ impl BufferPlan {
         let mut next = self.raw_at;
         let place = |camera: &usize| {
             let at = next;
+            // Red, green and blue, of a byte each.
             next += 3 * self.layout.cameras()[*camera].camera.pixels();
             holds_pixels.then_some(at)
         };
@@ -117,6 +118,7 @@ impl BufferPlan {
         self.semantics_at += own.semantics;
         self.raw_at += own.raw;
         // Disjoint slices for each target: threads can write all of them at once.
+        // The last part first, because all places count from the start of the buffer.
         let (maps_part, raw_part) = buffer.split_at_mut(raw_at);
         let (maps_part, semantics_part) = maps_part.split_at_mut(semantics_at);
         let (float_part, instances_part) = maps_part.split_at_mut(instances_at);

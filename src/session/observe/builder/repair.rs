@@ -247,8 +247,9 @@ impl ObservationBuilder {
             if session.needs_reference() {
                 let world_from_camera = &candidate.view.world_from_camera;
                 // A pose that the ego is not at has no history.
-                let kept = repair.state.references[candidate.camera].as_deref();
-                let kept = kept.filter(|_| repair.has_history);
+                let kept = repair.state.references[candidate.camera]
+                    .as_deref()
+                    .filter(|_| repair.has_history);
                 candidate.nearest = views.nearest(camera, world_from_camera, world_from_rig, kept);
                 candidate.nearest.iter().for_each(&mut want);
             }

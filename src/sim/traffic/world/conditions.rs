@@ -48,6 +48,7 @@ impl World {
     fn ego_station_m(&self, index: usize, instant: &Instant<'_>) -> Option<f64> {
         *instant.ego_station_m.get_or_init(|| {
             let (course, _) = self.progress[index].motion.course()?;
+            // The ego is the first of the bodies.
             Some(course.nearest(instant.bodies[0].center_m).station_m)
         })
     }
@@ -66,6 +67,7 @@ impl World {
         if is_plain(when) {
             return self.holds(Some(index), when, instant);
         }
+        // Taken out, because `holds` borrows the whole world meanwhile.
         let mut state = std::mem::take(&mut self.progress[index].fired[at].condition);
         let own = |part: &Condition| self.holds(Some(index), part, instant);
         let value = state.value(when, self.time_us, &own);

@@ -69,8 +69,9 @@ impl World {
     /// The world at the start of an episode, at time 0.
     pub fn new(traffic: Arc<Traffic>) -> Self {
         let progress: Vec<ActorProgress> = traffic.actors.iter().map(ActorProgress::new).collect();
-        let states = progress.iter().enumerate();
-        let states = states
+        let states = progress
+            .iter()
+            .enumerate()
             // An actor that is not there yet has a state as well, so that the list stays in order
             // of the indices.
             .map(|(index, progress)| {

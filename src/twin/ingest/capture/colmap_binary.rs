@@ -41,8 +41,12 @@ impl<'a> Bytes<'a> {
     }
 
     fn take<const N: usize>(&mut self) -> Result<[u8; N], CaptureError> {
-        let taken = self.bytes.get(self.at..).and_then(|rest| rest.first_chunk::<N>()).copied();
-        let taken = taken.ok_or_else(|| self.ended())?;
+        let taken = self
+            .bytes
+            .get(self.at..)
+            .and_then(|rest| rest.first_chunk::<N>())
+            .copied()
+            .ok_or_else(|| self.ended())?;
         self.at += N;
         Ok(taken)
     }
@@ -64,6 +68,7 @@ impl<'a> Bytes<'a> {
     }
 
     fn skip(&mut self, bytes: u64) -> Result<(), CaptureError> {
+        // The length comes from the file: a sum that overflows is an end beyond the file, too.
         let end = usize::try_from(bytes).ok().and_then(|bytes| self.at.checked_add(bytes));
         match end.filter(|&end| end <= self.bytes.len()) {
             Some(end) => self.at = end,
@@ -76,8 +81,8 @@ impl<'a> Bytes<'a> {
     fn text(&mut self) -> Result<String, CaptureError> {
         let rest = &self.bytes[self.at..];
         let length = rest.iter().position(|&byte| byte == 0).ok_or_else(|| self.ended())?;
-        let text = String::from_utf8(rest[..length].to_vec());
-        let text = text.map_err(|_| self.wrong("the name of the image is not UTF-8: rename it"))?;
+        let text = String::from_utf8(rest[..length].to_vec())
+            .map_err(|_| self.wrong("the name of the image is not UTF-8: rename it"))?;
         self.at += length + 1;
         Ok(text)
     }
@@ -95,6 +100,8 @@ impl<'a> Bytes<'a> {
 fn read_cameras(path: &Path) -> Result<BTreeMap<i32, Camera>, CaptureError> {
     let mut bytes = Bytes::open(path)?;
     let mut cameras = BTreeMap::new();
+    // The count is untrusted, so nothing is allocated for it: a count that is too large ends at
+    // `ended`.
     for _ in 0..bytes.u64()? {
         let id = bytes.i32()?;
         let number = bytes.i32()?;
@@ -105,9 +112,11 @@ fn read_cameras(path: &Path) -> Result<BTreeMap<i32, Camera>, CaptureError> {
             )));
         };
         model.check_supported().map_err(|reason| bytes.wrong(format!("camera {id}: {reason}")))?;
+        // The number of parameters follows from the model and is not in the file.
         let parameters: Result<Vec<f64>, _> = (0..model.parameters).map(|_| bytes.f64()).collect();
-        let camera = model.camera(size, &parameters?);
-        let camera = camera.map_err(|reason| bytes.wrong(format!("camera {id}: {reason}")))?;
+        let camera = model
+            .camera(size, &parameters?)
+            .map_err(|reason| bytes.wrong(format!("camera {id}: {reason}")))?;
         if cameras.insert(id, camera).is_some() {
             return Err(bytes.wrong(format!("camera {id} occurs twice: write the model again")));
         }
@@ -132,6 +141,7 @@ fn read_images(
         let world_from_camera = pose(q_wxyz, translation)
             .map_err(|reason| bytes.wrong(format!("image {id}: {reason}")))?;
         let points = bytes.u64()?;
+        // Features of an image are not used. Saturated, a count that is too large fails in `skip`.
         bytes.skip(points.saturating_mul(POINT_BYTES))?;
         let Some(camera) = cameras.get(&camera_id) else {
             return Err(bytes.wrong(format!(
@@ -163,6 +173,7 @@ pub(super) fn read_points(path: &Path) -> Result<Vec<CapturePoint>, CaptureError
             return Err(bytes.wrong(format!("point {id} is at {at:?}: write the model again")));
         }
         let rgb8 = bytes.take::<3>()?;
+        // Read only to pass over it: the error of reprojection is not used.
         let _error_px = bytes.f64()?;
         let track = bytes.u64()?;
         bytes.skip(track.saturating_mul(TRACK_BYTES))?;

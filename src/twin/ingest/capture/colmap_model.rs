@@ -7,7 +7,7 @@ use glam::DQuat;
 use wildcity_scene::geometry::camera::{Fisheye, Lens, OpenCv, Pinhole};
 use wildcity_scene::geometry::{Camera, Pose};
 
-/// A camera model.
+/// A camera model of COLMAP, by its names in text and binary files.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Model {
     /// Its number in binary files.
@@ -67,6 +67,7 @@ impl Model {
         let (pinhole, lens) = match (self.name, parameters) {
             ("SIMPLE_PINHOLE", &[f, cx, cy]) => (pinhole(f, f, cx, cy), Lens::Pinhole),
             ("PINHOLE", &[fx, fy, cx, cy]) => (pinhole(fx, fy, cx, cy), Lens::Pinhole),
+            // Radial terms are the first of OpenCV's, in the same normalized coordinates.
             ("SIMPLE_RADIAL", &[f, cx, cy, k]) => {
                 (pinhole(f, f, cx, cy), opencv([k, 0.0, 0.0, 0.0, 0.0, 0.0], [0.0; 2]))
             }
@@ -92,6 +93,8 @@ impl Model {
             }
             _ => return Err(self.unsupported()),
         };
+        // Clamped, not truncated: 2³² + 640 must not pass as 640. The check below refuses the
+        // maximum.
         let side = |px: u64| u32::try_from(px).unwrap_or(u32::MAX);
         let [width_px, height_px] = size.map(side);
         let camera =
@@ -105,12 +108,14 @@ impl Model {
 pub(super) fn pose(q_wxyz: [f64; 4], translation: [f64; 3]) -> Result<Pose, String> {
     let [w, x, y, z] = q_wxyz;
     let length = DQuat::from_xyzw(x, y, z, w).length();
+    // A length far from 1 is damage and not rounding; half and double are generous bounds.
     let is_usable = (0.5..2.0).contains(&length);
     if !is_usable {
         return Err(format!(
             "the quaternion (w, x, y, z) has length {length:?}; a rotation has 1: write the model again"
         ));
     }
+    // COLMAP stores where the world is in the camera, and this program the opposite.
     let camera_from_world = Pose::checked(translation, q_wxyz.map(|q| q / length));
     Ok(camera_from_world.map_err(|cause| cause.to_string())?.inverse())
 }

@@ -50,7 +50,8 @@ fn read_cameras(path: &Path) -> Result<BTreeMap<u64, Camera>, CaptureError> {
         };
         model.check_supported().map_err(wrong)?;
         if parameters.len() != model.parameters {
-            let (given, needed) = (parameters.len(), model.parameters);
+            let given = parameters.len();
+            let needed = model.parameters;
             return Err(wrong(format!("{given} parameters; {name} has {needed}")));
         }
         let camera = model.camera(size, &parameters).map_err(wrong)?;
@@ -103,6 +104,8 @@ fn read_images(
             continue;
         }
         let wrong = |reason: String| CaptureError::at(path, Place::Line(index + 1), reason);
+        // The name is the rest of the line and may contain spaces, so only the nine words before it
+        // are split.
         let mut rest = line.trim_start();
         let mut words = [""; 9];
         for word in &mut words {

@@ -40,14 +40,15 @@ impl<'a> Column<'a> {
         if accessor.sparse.is_some() {
             return Err(format!("accessor {index} is sparse; export it dense"));
         }
-        let view = accessor.buffer_view.and_then(|view| document.buffer_views.get(view));
-        let view = view.ok_or(format!("accessor {index} has no bufferView that exists"))?;
+        let view = accessor
+            .buffer_view
+            .and_then(|view| document.buffer_views.get(view))
+            .ok_or(format!("accessor {index} has no bufferView that exists"))?;
         if let Some(name) = view.extensions.keys().next() {
             return Err(format!("its bufferView is compressed by {name}; export it without"));
         }
-        let component = Component::from_number(accessor.component_type);
-        let component =
-            component.ok_or(format!("componentType {} is not read", accessor.component_type))?;
+        let component = Component::from_number(accessor.component_type)
+            .ok_or(format!("componentType {} is not read", accessor.component_type))?;
         let row_bytes = (component.bytes() * width) as u64;
         let stride = view.byte_stride.unwrap_or(row_bytes);
         // glTF allows 4 to 252. A stride shorter than a row would make rows overlap, so that few
@@ -73,6 +74,8 @@ impl<'a> Column<'a> {
                 buffer.len()
             ));
         }
+        // Both offsets lie within the buffer by the checks above, so that the sum does not
+        // overflow.
         let start = (view.byte_offset + accessor.byte_offset) as usize;
         Ok(Self {
             count: accessor.count as usize,
@@ -88,6 +91,7 @@ impl<'a> Column<'a> {
         let start = self.stride * index;
         let bytes = self.component.bytes();
         std::array::from_fn(|i| {
+            // Of signed integers the smallest one stands for -1, as the next one does.
             let value = self.component.value(&self.bytes[start + bytes * i..]);
             if self.normalized { (value / self.component.most()).max(-1.0) } else { value }
         })

@@ -71,8 +71,10 @@ impl Primitive {
     /// The extension that compresses the attributes, if there is one, and its settings.
     pub(super) fn compressed_by(&self) -> Option<(&str, &Value)> {
         let inner = self.extensions.get(EXTENSION)?.get("extensions")?.as_object()?;
-        let mut inner = inner.iter().map(|(name, settings)| (name.as_str(), settings));
-        inner.find(|(name, _)| name.contains("compression"))
+        inner
+            .iter()
+            .map(|(name, settings)| (name.as_str(), settings))
+            .find(|(name, _)| name.contains("compression"))
     }
 }
 

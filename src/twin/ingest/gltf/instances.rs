@@ -35,10 +35,13 @@ pub(super) fn mesh_instances(document: &Document) -> Result<Vec<MeshInstance<'_>
             ));
         }
         let scene_from_mesh = scene_from_parent * parent_from_node(node);
+        // Reversed, because the last one that is pushed is the first to be visited.
         waiting.extend(node.children.iter().rev().map(|&child| (child, scene_from_mesh)));
         if let Some(own) = node.mesh {
-            let mesh = document.meshes.get(own);
-            let mesh = mesh.ok_or_else(|| bad(&place, "its mesh does not exist".into()))?;
+            let mesh = document
+                .meshes
+                .get(own)
+                .ok_or_else(|| bad(&place, "its mesh does not exist".into()))?;
             placed.push(MeshInstance { node: index, index: own, mesh, scene_from_mesh });
         }
     }
@@ -73,10 +76,11 @@ impl MeshInstance<'_> {
             return Ok(());
         }
         let turn = DMat3::from_mat4(self.scene_from_mesh);
+        // A uniform scale s has the determinant s³, and a reflection changes only its sign.
         let scale = turn.determinant().abs().cbrt();
         let rows = (turn * scale.recip()).transpose().to_cols_array_2d();
-        let axes = Axes::from_rows(rows).and_then(|axes| axes.scaled(scale));
-        let axes = axes.map_err(|_| {
+        let found = Axes::from_rows(rows).and_then(|axes| axes.scaled(scale));
+        let axes = found.map_err(|_| {
             let reason = "its matrix is not a rotation, perhaps with a reflection and a uniform scale from 1e-6 to 1e6; bake \
                           it into the splats";
             bad(&format!("node {}", self.node), reason.into())

@@ -76,6 +76,7 @@ impl<'a> MaterialSource<'a> {
             emissive: textured("emissiveTexture", emissive_info)?,
             cutoff: match material.alpha_mode() {
                 AlphaMode::Mask => material.alpha_cutoff().unwrap_or(0.5).into(),
+                // No opacity is below 0, so that no point is cut away.
                 AlphaMode::Opaque | AlphaMode::Blend => 0.0,
             },
             is_solid: material.alpha_mode() == AlphaMode::Opaque,
@@ -168,7 +169,7 @@ impl TextureArea {
     }
 }
 
-/// Reads an image.
+/// Decodes the file of an image, from a buffer or from its URI.
 pub(super) fn decode(
     image: &gltf::Image<'_>,
     buffers: &[&[u8]],

@@ -51,6 +51,7 @@ pub(super) fn read(
                 Place { node: placed.node, mesh: mesh.index(), primitive: primitive.index() };
             let source =
                 MaterialSource::from_gltf(&primitive.material()).map_err(|r| place.bad(r))?;
+            // Each image is decoded once, however many primitives use it.
             for image in source.images() {
                 if let Entry::Vacant(unread) = textures.entry(image.index()) {
                     unread.insert(material::decode(image, buffers, uris)?);
@@ -72,6 +73,7 @@ pub(super) fn read(
             "the scene has neither splats nor triangles with an area".into(),
         ));
     }
+    // The area of one Gaussian, if the requested number covered the scene evenly.
     let share_m2 = area_m2 / f64::from(uris.parts().mesh_gaussians());
     let longest_m = LONGEST * share_m2.sqrt();
     // A triangle without area is invisible, however long it is.
@@ -91,6 +93,7 @@ pub(super) fn read(
         }
     });
     let triangles: Vec<Triangle> = halved.collect();
+    // A triangle is divided into `cuts`² cells with a Gaussian each.
     let count: u128 = triangles.iter().map(|t| u128::from(t.cuts(share_m2)).pow(2)).sum();
     // The caller may ask for more Gaussians than a file of this size would be allowed.
     let more = uris.parts().mesh_gaussians().saturating_sub(limits::MESH_GAUSSIANS);
@@ -236,6 +239,7 @@ impl PrimitiveReader<'_> {
             corners_m: at(positions_m, indices)?,
             colors: colors.map(|color| self.source.base_color(color)),
             uv: uv.as_ref().map_or(Some([DVec2::ZERO; 3]), |uv| at(uv, indices))?,
+            // Boxed, because few triangles emit light: the others take less memory so.
             emissive_uv: emissive_uv.ok()?.map(Box::new),
             material: Arc::clone(&self.material),
         })
@@ -270,6 +274,7 @@ fn check(
     if stride < size {
         return Err(format!("byteStride {stride}; {size} to 252 are possible"));
     }
+    // The last row need not be padded to the stride.
     let end = accessor.offset() as u128 + stride * count.saturating_sub(1) + size;
     let view_end = view.offset() as u128 + view.length() as u128;
     let held = buffers.get(view.buffer().index()).map_or(0, |buffer| buffer.len() as u128);

@@ -88,6 +88,7 @@ pub(super) fn read_glb(
     if version != 2 {
         return Err(bad("bytes 4 to 7", format!("version {version}; 2 is read")));
     }
+    // A copy that ended early, or bytes appended to it, would be read as another scene.
     if length as usize != file.len() {
         return Err(IngestError::Size {
             format: FORMAT,
@@ -111,6 +112,7 @@ pub(super) fn read_glb(
             });
         };
         match kind {
+            // The specification allows one of each. Of more, the first counts.
             JSON => json = json.or(Some(chunk)),
             BIN => buffer = buffer.or(Some(chunk)),
             _ => (),
@@ -150,8 +152,13 @@ pub(super) fn read(
     }
     let mut buffers: Vec<&[u8]> = Vec::new();
     for (index, (bytes, buffer)) in fetched.iter().zip(&document.buffers).enumerate() {
-        let bytes = bytes.as_ref().map(|bytes| &bytes[..]);
-        let bytes = bytes.or(own_buffer.filter(|_| index == 0)).unwrap_or_default();
+        // Only the first buffer may be the chunk within a GLB file.
+        let bytes = bytes
+            .as_ref()
+            .map(|bytes| &bytes[..])
+            .or(own_buffer.filter(|_| index == 0))
+            .unwrap_or_default();
+        // A buffer may be longer than it declares, as GLB pads chunks to four bytes.
         let Some(bytes) = bytes.get(..buffer.byte_length as usize) else {
             return Err(IngestError::Size {
                 format: FORMAT,
@@ -183,6 +190,7 @@ pub(super) fn read(
             check_count(all.len() as u64)?;
         }
     }
+    // A scene with both is drawn by its splats alone.
     if !found {
         all = mesh::read(json, &placed, &buffers, &mut uris)?;
     }
@@ -201,9 +209,9 @@ fn read_primitive(
     match primitive.compressed_by() {
         Some((SPZ, settings)) => {
             let view = settings.get("bufferView").and_then(Value::as_u64);
-            let bytes = view.and_then(|view| document.view_bytes(buffers, view as usize));
-            let bytes =
-                bytes.ok_or_else(|| bad(place, format!("{SPZ} has no bufferView that exists")))?;
+            let bytes = view
+                .and_then(|view| document.view_bytes(buffers, view as usize))
+                .ok_or_else(|| bad(place, format!("{SPZ} has no bufferView that exists")))?;
             let mut part =
                 spz::read_gzip_within(bytes, bytes.len() as u64, parts.budget(), reading)?;
             turn_compressed(&mut part, reading);
@@ -215,8 +223,10 @@ fn read_primitive(
         None => {}
     }
     let column = |name: &str, width: usize| {
-        let index = primitive.attributes.get(name);
-        let index = *index.ok_or_else(|| bad(place, format!("has no attribute {name}")))?;
+        let index = *primitive
+            .attributes
+            .get(name)
+            .ok_or_else(|| bad(place, format!("has no attribute {name}")))?;
         Column::find(document, buffers, index, width)
             .map_err(|reason| bad(&format!("{place}, {name}"), reason))
     };
@@ -232,6 +242,7 @@ fn read_primitive(
         ));
     }
     let mut colours = Vec::new();
+    // Degree l has 2 l + 1 coefficients, named by degree and index in the order in memory.
     for (degree, n) in (0..=sh_degree.unwrap_or(0)).flat_map(|l| (0..=2 * l).map(move |n| (l, n))) {
         match sh_degree {
             Some(_) => colours.push(own(&format!("SH_DEGREE_{degree}_COEF_{n}"), 3)?),
@@ -247,6 +258,8 @@ fn read_primitive(
     }
     // Nodes may instance one mesh many times, so that counts as unpacking, too.
     let sh_degree_held = sh_degree.unwrap_or(0);
+    // 56 = 24 for the position in 64 bits, 16 rotation, 12 scales and 4 opacity; each coefficient
+    // has 12.
     let row_bytes = 56 + 12 * sh::coefficients(sh_degree_held) as u128;
     parts.budget().unpack(FORMAT, place, row_bytes * count as u128)?;
     let mut g = Gaussians::with_capacity(sh_degree_held, check_count(count as u64)?);
@@ -257,6 +270,7 @@ fn read_primitive(
     }));
     let is_negative = |i: &usize| scales.row::<3>(*i).iter().any(|&s| s < 0.0);
     // Nearly all logarithms are negative, and no standard deviation is, except for damaged ones.
+    // One in ten, so that a few damaged scales do not turn a whole scene into logarithms.
     let are_logarithms = (0..count).filter(is_negative).count() * 10 > count;
     g.ln_scales.extend((0..count).map(|i| {
         scales.row::<3>(i).map(|s| if are_logarithms { s as f32 } else { activation::ln_scale(s) })
@@ -266,6 +280,7 @@ fn read_primitive(
         for colour in &colours {
             let rgb = colour.row::<3>(i);
             g.sh.extend(rgb.map(|c| {
+                // Base colours are linear light, and coefficients are of the stored (sRGB) colour.
                 if sh_degree.is_some() { c as f32 } else { activation::dc(stored_from_linear(c)) }
             }));
         }

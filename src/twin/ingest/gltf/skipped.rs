@@ -38,6 +38,7 @@ pub(super) fn check(document: &Document, placed: &[MeshInstance<'_>], reading: &
     let mut attributes = BTreeSet::new();
     let mut targets = Vec::new();
     for (place, primitive) in primitives {
+        // With splats in the scene, its triangles are not drawn.
         if any_splats && !has_splats(primitive) {
             meshes.push(place);
             continue;

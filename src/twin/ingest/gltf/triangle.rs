@@ -83,6 +83,7 @@ impl Triangle {
                 parts.push(triangle);
                 continue;
             }
+            // Each end of the edge is moved to its middle in turn, which makes the two halves.
             for replaced in [k, (k + 1) % 3] {
                 let mut half = triangle.clone();
                 let other = if replaced == k { (k + 1) % 3 } else { k };
@@ -114,6 +115,8 @@ impl Triangle {
             for j in 0..cuts - i {
                 let centre = |third: f64| [f64::from(i) + third, f64::from(j) + third];
                 let upright = Some(centre(1.0 / 3.0));
+                // Beside each upright part lies an inverted one, except at the edge opposite the
+                // first corner.
                 let turned = (j + 1 < cuts - i).then(|| centre(2.0 / 3.0));
                 for [u, v] in upright.into_iter().chain(turned) {
                     let [u, v] = [u, v].map(|share| share / f64::from(cuts));
@@ -149,10 +152,13 @@ impl Triangle {
         covariance *= (WIDER / f64::from(cuts)).powi(2) / 12.0;
         // The eigenvectors and eigenvalues of a symmetric 2 x 2 matrix: the angle of the major axis
         // is atan2(2 xy, xx - yy) / 2, the variances are (xx + yy) / 2 ± √((xx - yy)² / 4 + xy²).
-        let [xx, xy, yy] = [covariance.x_axis.x, covariance.x_axis.y, covariance.y_axis.y];
+        let xx = covariance.x_axis.x;
+        let xy = covariance.x_axis.y;
+        let yy = covariance.y_axis.y;
         let angle = 0.5 * (2.0 * xy).atan2(xx - yy);
         let spread = (0.25 * (xx - yy).powi(2) + xy * xy).sqrt();
         let middle = 0.5 * (xx + yy);
+        // Rounding may bring the smaller variance below 0.
         let [long_m, short_m] = [middle + spread, (middle - spread).max(0.0)].map(f64::sqrt);
         let long = angle.cos() * across + angle.sin() * up;
         let axes = DMat3::from_cols(long, normal.cross(long), normal);
@@ -182,6 +188,7 @@ impl Triangle {
         }
         let opacity = match color.w {
             _ if *is_solid => 1.0,
+            // The condition says what is visible, so that NaN is not.
             alpha if alpha >= *cutoff => alpha.clamp(0.0, 1.0),
             _ => 0.0,
         };
@@ -193,6 +200,7 @@ impl Triangle {
 /// Linear red, green and blue, and alpha, at a point of an image.
 fn sample(image: &RgbaImage, uv: DVec2) -> DVec4 {
     // Repeated, which is glTF's default.
+    // Just below 0, `rem_euclid` rounds up to 1, hence the minimum.
     let place =
         |share: f64, size: u32| ((share.rem_euclid(1.0) * f64::from(size)) as u32).min(size - 1);
     let texel = image.get_pixel(place(uv.x, image.width()), place(uv.y, image.height()));
@@ -291,11 +299,11 @@ mod tests {
         assert!((100..=1 << HALVINGS).contains(&parts.len()), "{}", parts.len());
         let sum_m2: f64 = parts.iter().map(Triangle::area_m2).sum();
         assert!((sum_m2 / area_m2 - 1.0).abs() < 1e-12);
-        let longest_m = parts.iter().flat_map(|part| {
+        let sides_m = parts.iter().flat_map(|part| {
             let [a, b, c] = part.corners_m;
             [a.distance(b), b.distance(c), c.distance(a)]
         });
-        let longest_m = longest_m.fold(0.0, f64::max);
+        let longest_m = sides_m.fold(0.0, f64::max);
         assert!(longest_m <= 0.1, "{longest_m}");
         // However long, and however thin; and what is not thin stays whole.
         let line = triangle([[0.0; 3], [1e9, 0.0, 0.0], [2e9, 0.0, 0.0]]);

@@ -40,6 +40,7 @@ impl<'a> Uris<'a> {
             let (_, text) = data
                 .split_once(";base64,")
                 .ok_or_else(|| bad(place, "its data URI has no \";base64,\"".into()))?;
+            // Fewer bytes than their text, which the document holds already.
             let bytes = BASE64.decode(text.as_bytes());
             return bytes.map(Rc::new).map_err(|e| bad(place, format!("its base64: {e}")));
         }
@@ -47,6 +48,7 @@ impl<'a> Uris<'a> {
             return Ok(known.clone());
         }
         let bytes = Rc::new(self.parts.read(uri, self.left_bytes)?);
+        // `read` has refused a file of more bytes, so that this does not underflow.
         self.left_bytes -= bytes.len() as u64;
         self.files.insert(uri.to_owned(), bytes.clone());
         Ok(bytes)

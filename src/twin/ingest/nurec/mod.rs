@@ -54,6 +54,8 @@ pub(super) fn read(
     let bytes = unpack(payload, budget)?;
     let root = msgpack::parse(&bytes).map_err(|reason| bad("MessagePack", reason))?;
     let payload = Payload::from_root(&root)?;
+    // A layer with tracks holds objects in the axes of their cuboids. Drawn with the rest, they
+    // would all lie in each other at the origin.
     let is_static = |name: &&str| payload.layer_tracks(name).is_empty();
     let layers: Vec<&str> = payload.names.iter().copied().filter(is_static).collect();
     let moving: Vec<&str> = payload.names.iter().copied().filter(|name| !is_static(name)).collect();
@@ -69,6 +71,7 @@ pub(super) fn read(
     }
     let mut all = Gaussians::default();
     for name in layers {
+        // A cancelled push ends between two layers.
         budget.check_stop()?;
         match payload.settings.get(name) {
             Some(settings) => settings::warn_skipped(settings, name, reading),
@@ -80,6 +83,8 @@ pub(super) fn read(
         let mut layer = payload.layer(name)?.read()?;
         layer.classes = layer_class(name).map(|class| vec![class; layer.len()]);
         all.append(&layer);
+        // Checked as layers are added, so that the sum cannot pass the limit by more than one
+        // layer.
         check_count(all.len() as u64)?;
     }
     reading.accept(all, &Field::plain_name)
@@ -103,12 +108,16 @@ pub(super) fn read_tracked(
         let layer = payload.layer(name)?;
         let mut gaussians = layer.read()?;
         check_count(gaussians.len() as u64)?;
+        // As for a scene: values at the ends of their ranges are clamped before the bounds are
+        // checked.
         gaussians.clamp_activations();
         validate::check(&gaussians, &Field::plain_name)?;
         let ids = layer.cuboid_ids(gaussians.len(), tracks.len())?;
+        // A negative id is no index: its Gaussian is of no track, and is left out.
         let track = |id: i64| match tracks.get(usize::try_from(id).ok()?)? {
             Value::Text(track) => Some((*track).to_owned()),
             Value::Count(number) => Some(number.to_string()),
+            // Other values cannot be printed: the index tells such tracks apart.
             _ => Some(id.to_string()),
         };
         found.extend(objects::split(&gaussians, &ids, track));
@@ -127,9 +136,11 @@ fn unpack(payload: &[u8], budget: &mut UnpackBudget) -> Result<Vec<u8>, IngestEr
     let limit = budget.left_bytes();
     let mut bytes = Vec::new();
     let mut decoder = GzDecoder::new(payload);
+    // One byte over the limit is enough to make the budget below refuse the stream.
     let read = decoder.by_ref().take(limit + 1).read_to_end(&mut bytes);
     read.map_err(|e| bad("the gzip stream", format!("is damaged: {e}; copy it again")))?;
     budget.unpack(FORMAT, "the gzip stream", bytes.len() as u128)?;
+    // Data after the stream is a second payload or damage, and neither is read.
     let rest = decoder.into_inner();
     if !rest.is_empty() {
         return Err(bad("the gzip stream", format!("is followed by {} bytes", rest.len())));
@@ -154,8 +165,9 @@ impl<'a> Payload<'a> {
         let state = data.get("state_dict").ok_or_else(|| missing("nre_data.state_dict"))?;
         let tracks = state.get("._extra_state").and_then(|extra| extra.get("obj_track_ids"));
         let settings = data.get("config").and_then(|config| config.get("layers"));
-        let names = state.keys();
-        let names = names.filter_map(|key| key.strip_prefix(LAYERS)?.strip_suffix(".positions"));
+        let keys = state.keys();
+        // Every layer has positions, so these keys name all layers.
+        let names = keys.filter_map(|key| key.strip_prefix(LAYERS)?.strip_suffix(".positions"));
         // A key may be repeated: the first one counts.
         let mut seen = BTreeSet::new();
         let names: Vec<&str> = names.filter(|&name| seen.insert(name)).collect();
@@ -174,6 +186,8 @@ impl<'a> Payload<'a> {
 
     /// Warns of what the model has besides the layers of Gaussians.
     fn warn_skipped(&self, reading: &mut Reading) {
+        // The last part is the field, or `shape` for the shape of one. A layer's name may contain
+        // dots.
         let is_read = |key: &&str| {
             let field = key.strip_prefix(LAYERS).and_then(|rest| rest.rsplit('.').next());
             field.is_some_and(|field| READ_FIELDS.contains(&field)) || *key == "._extra_state"
@@ -216,12 +230,15 @@ impl Layer<'_> {
         let densities = self.array("densities", Some(1), rows)?;
         let albedo = self.array("features_albedo", Some(3), rows)?;
         let specular = self.array("features_specular", None, rows)?;
-        let held =
-            (0..=sh::MAX_DEGREE).find(|&d| 3 * (sh::coefficients(d) - 1) == specular.columns);
-        let held = held.ok_or_else(|| {
-            let reason = format!("{} columns; 0, 9, 24 or 45 make an SH degree", specular.columns);
-            bad(&self.key("features_specular"), reason)
-        })?;
+        // Degree d has (d + 1)² coefficients, of which one is in `features_albedo`; each has 3
+        // channels.
+        let held = (0..=sh::MAX_DEGREE)
+            .find(|&d| 3 * (sh::coefficients(d) - 1) == specular.columns)
+            .ok_or_else(|| {
+                let reason =
+                    format!("{} columns; 0, 9, 24 or 45 make an SH degree", specular.columns);
+                bad(&self.key("features_specular"), reason)
+            })?;
         let sh_degree = self.active_degree().map_or(held, |active| held.min(active));
         let count = check_count(means.rows as u64)?;
         let mut g = Gaussians::with_capacity(sh_degree, count);
@@ -242,6 +259,7 @@ impl Layer<'_> {
         let Some(Value::Bytes(bytes)) = self.fields.get(&*key) else {
             return Err(bad(&key, "is not an array of bytes".into()));
         };
+        // The width is not recorded, so the number of bytes decides it.
         let ids: Vec<i64> = if bytes.len() == 4 * rows {
             bytes.as_chunks().0.iter().map(|id| i32::from_le_bytes(*id).into()).collect()
         } else if bytes.len() == 8 * rows {
@@ -251,6 +269,7 @@ impl Layer<'_> {
                 format!("{} bytes, which is not the size of {rows} i32 or i64", bytes.len());
             return Err(bad(&key, reason));
         };
+        // Negative ids mean no track, and pass.
         let beyond = ids.iter().find(|&&id| usize::try_from(id).is_ok_and(|id| id >= tracks));
         match beyond {
             Some(id) => Err(bad(&key, format!("{id} is a track; there are {tracks}"))),
@@ -297,6 +316,7 @@ impl Layer<'_> {
         let Some(Value::Bytes(bytes)) = self.fields.get(&*key) else {
             return Err(bad(&key, "is not an array of bytes".into()));
         };
+        // In 128 bits, because the shape is untrusted and its product may not fit 64 bits.
         let values = found_rows as u128 * found_columns as u128;
         let is_f32 = values * 4 == bytes.len() as u128;
         if !is_f32 && values * 2 != bytes.len() as u128 {

@@ -51,6 +51,7 @@ impl<'a> Value<'a> {
         let entries = if let Value::Map(entries) = self { &entries[..] } else { &[] };
         for (key, value) in entries {
             if let Value::Text(key) = key {
+                // The first of equal keys, as `get`.
                 index.entry(*key).or_insert(value);
             }
         }
@@ -79,15 +80,18 @@ struct Parser<'a> {
 impl<'a> Parser<'a> {
     fn value(&mut self, depth: usize) -> Result<Value<'a>, String> {
         self.values += 1;
+        // Each level is a call of this function, so that the bound protects the stack.
         if depth > MAX_DEPTH {
             return Err(format!("byte {}: more than {MAX_DEPTH} values in each other", self.at));
         }
+        // A value of one byte in the file takes 32 bytes in memory.
         if self.values > limits::NUREC_VALUES {
             return Err(format!("more than {} values", limits::NUREC_VALUES));
         }
         let start = self.at;
         let kind = self.number(1)?;
         Ok(match kind {
+            // In the first four kinds, the low bits of the first byte are the number or the length.
             0x00..=0x7f => Value::Count(kind),
             0x80..=0x8f => self.map(kind & 0x0f, depth)?,
             0x90..=0x9f => self.array(kind & 0x0f, depth)?,
@@ -95,6 +99,7 @@ impl<'a> Parser<'a> {
             0xc2 | 0xc3 => Value::Bool(kind == 0xc3),
             // nil; small negative numbers.
             0xc0 | 0xe0..=0xff => Value::Other,
+            // The length has 1, 2 or 4 bytes.
             0xc4..=0xc6 => {
                 let length = self.number(1 << (kind - 0xc4))?;
                 Value::Bytes(self.take(length)?)
@@ -104,20 +109,24 @@ impl<'a> Parser<'a> {
                 let length = self.number(1 << (kind - 0xc7))?;
                 self.skip(length.saturating_add(1))?
             }
+            // Floats, of 4 and of 8 bytes.
             0xca => self.skip(4)?,
             0xcb => self.skip(8)?,
             0xcc..=0xcf => Value::Count(self.number(1 << (kind - 0xcc))?),
+            // Signed numbers of 1, 2, 4 or 8 bytes. The highest bit is set in those below 0.
             0xd0..=0xd3 => {
                 let bytes = 1 << (kind - 0xd0);
                 let number = self.number(bytes)?;
                 if number >> (8 * bytes - 1) == 0 { Value::Count(number) } else { Value::Other }
             }
+            // Extensions of 1, 2, 4, 8 or 16 bytes, after a byte for their type.
             0xd4..=0xd8 => self.skip((1 << (kind - 0xd4)) + 1)?,
             0xd9..=0xdb => {
                 let length = self.number(1 << (kind - 0xd9))?;
                 self.text(length)?
             }
             0xdc | 0xdd => {
+                // The length has 2 or 4 bytes.
                 let length = self.number(2 << (kind - 0xdc))?;
                 self.array(length, depth)?
             }
@@ -166,8 +175,8 @@ impl<'a> Parser<'a> {
 
     fn take(&mut self, length: u64) -> Result<&'a [u8], String> {
         let left = &self.bytes[self.at..];
-        let taken = usize::try_from(length).ok().and_then(|length| left.get(..length));
-        let taken = taken.ok_or_else(|| {
+        let found = usize::try_from(length).ok().and_then(|length| left.get(..length));
+        let taken = found.ok_or_else(|| {
             format!("byte {}: {length} bytes are wanted, {} are left", self.at, left.len())
         })?;
         self.at += taken.len();

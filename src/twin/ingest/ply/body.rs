@@ -29,6 +29,8 @@ impl<R: BufRead> Body<'_, R> {
     ) -> Result<(), IngestError> {
         let mut row = vec![0; element.stride];
         let mut line = Vec::new();
+        // A row without columns takes no bytes, so that its count, which is untrusted, must not
+        // drive a loop.
         let count = if element.stride == 0 { 0 } else { element.count };
         for index in 0..count {
             match self.encoding {
@@ -75,6 +77,7 @@ impl<R: BufRead> Body<'_, R> {
     fn read_line(&mut self, line: &mut Vec<u8>) -> Result<(), IngestError> {
         line.clear();
         let limit = limits::PLY_LINE_BYTES;
+        // Bounded, because a binary file that claims to be text may have no line break at all.
         let read = (&mut self.input).take(limit).read_until(b'\n', line)? as u64;
         self.done += read;
         if read == limit && line.last() != Some(&b'\n') {
@@ -95,6 +98,7 @@ fn parse_row(element: &Element, line: &[u8], row: &mut [u8]) -> Result<(), Strin
         parse_scalar(property.scalar, word, to)
             .ok_or_else(|| format!("{} is {word:?}, not a number of its type", property.name))?;
     }
+    // A number too many shows that the columns are not those that the header declares.
     match words.next() {
         None => Ok(()),
         Some(_) => Err(format!("more than the {wanted} numbers that are declared")),

@@ -42,6 +42,7 @@ impl Columns {
             (0..count).map(|i| format!("{prefix}_{i}")).collect::<Vec<_>>()
         };
         let sh_degree = degree(vertex)?;
+        // The columns f_rest_* are channel-major, which `file_name` accounts for.
         let rest = (1..sh::coefficients(sh_degree)).flat_map(|k| (0..3).map(move |c| (k, c)));
         let rest: Vec<_> = rest.map(|(k, c)| file_name(Field::Sh(k, c), sh_degree)).collect();
         // 2D Gaussian splatting writes two scales.
@@ -109,10 +110,11 @@ impl Columns {
         let single = |property: &Property| property.value(row) as f32;
         gaussians.means_m.push(std::array::from_fn(|i| value(&self.means[i])));
         gaussians.quats_wxyz.push(std::array::from_fn(|i| single(&self.quats[i])));
+        // Flat Gaussians have no third scale. The smallest one that is accepted stands for it.
         let scale = |i: usize| self.scales.get(i).map_or(LN_SCALE[0], single);
-        let (ln_scales, logit) = (std::array::from_fn(scale), single(&self.opacity));
         let filter = self.filter.as_ref().map_or(0.0, value);
-        let (ln_scales, logit) = filtered(ln_scales, logit, filter);
+        let (ln_scales, logit) =
+            filtered(std::array::from_fn(scale), single(&self.opacity), filter);
         gaussians.ln_scales.push(ln_scales);
         gaussians.logit_opacities.push(logit);
         match &self.dc {
@@ -153,8 +155,11 @@ fn filtered(ln_scales: [f32; 3], logit: f32, filter: f64) -> ([f32; 3], f32) {
     if filter == 0.0 {
         return (ln_scales, logit);
     }
+    // The variances of the axes are squares of exp(ln scale), so 2 ln.
     let before = ln_scales.map(|ln| (2.0 * f64::from(ln)).exp());
     let after = before.map(|variance| variance + filter * filter);
+    // The integral is proportional to the opacity times the product of the standard deviations, so
+    // the opacity falls by the ratio of the products.
     let ratio: f64 = before.iter().zip(after).map(|(before, after)| before / after).product();
     let opacity = ratio.sqrt() / (1.0 + f64::from(-logit).exp());
     (after.map(|variance| (0.5 * variance.ln()) as f32), activation::logit(opacity))

@@ -26,6 +26,7 @@ fn is_setting(comment: &str) -> bool {
 pub(super) fn read(comment: &str, reading: &mut Reading) {
     let said_by = || format!("comment {comment:?}");
     let lower = comment.to_ascii_lowercase();
+    // Programs write `key value` or `key: value`.
     let words: Vec<&str> = lower.split([' ', ':']).filter(|word| !word.is_empty()).collect();
     match words[..] {
         // Brush and splat-transform.

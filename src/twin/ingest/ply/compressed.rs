@@ -20,7 +20,7 @@ use crate::ingest::{IngestError, Progress, check_count};
 /// Number of Gaussians in a chunk.
 const CHUNK: usize = 256;
 
-/// Reads the body.
+/// Reads the body: value ranges, vertices and higher SH degrees.
 pub(super) fn read(
     input: impl BufRead,
     header: &Header,
@@ -32,10 +32,10 @@ pub(super) fn read(
     let (chunk, vertex, colour) = tables(header)?;
     let sh_degree = colour.map_or(Ok(0), degree)?;
     let ranges = ValueRanges::find(chunk)?;
-    let packed = ["packed_position", "packed_rotation", "packed_scale", "packed_color"];
-    let packed = packed.map(|name| vertex.property(name).cloned());
-    let [position, rotation, scale, color] = packed;
-    let [position, rotation, scale, color] = [position?, rotation?, scale?, color?];
+    let position = vertex.property("packed_position").cloned()?;
+    let rotation = vertex.property("packed_rotation").cloned()?;
+    let scale = vertex.property("packed_scale").cloned()?;
+    let color = vertex.property("packed_color").cloned()?;
     let rest = colour.map_or(Ok(Vec::new()), |colour| higher_degrees(colour, sh_degree))?;
     header.check_size(file_bytes)?;
     let count = check_count(vertex.count)?;
@@ -49,6 +49,7 @@ pub(super) fn read(
     let mut gaussians = Gaussians::with_capacity(sh_degree, count);
     body.rows(vertex, |row| {
         let word = |property: &Property| property.value(row) as u32;
+        // `tables` has compared the lengths: there is a chunk for every 256 vertices.
         let [low, high] = chunks[gaussians.len() / CHUNK];
         let between = |first: usize, unit: [f64; 3]| -> [f64; 3] {
             let mix = |i| low[first + i] + (high[first + i] - low[first + i]) * unit[i];
@@ -58,6 +59,7 @@ pub(super) fn read(
         gaussians.quats_wxyz.push(unpack_rotation(word(&rotation)));
         let scale = between(3, unpack_11_10_11(word(&scale)));
         gaussians.ln_scales.push(scale.map(|ln| ln as f32));
+        // Red is in the highest byte.
         let [r, g, b, opacity] = word(&color).to_be_bytes().map(|byte| f64::from(byte) / 255.0);
         gaussians.logit_opacities.push(activation::logit(opacity));
         gaussians.sh.extend(between(6, [r, g, b]).map(activation::dc));
@@ -77,9 +79,9 @@ pub(super) fn read(
 
 /// Columns of the coefficients above degree 0, coefficient-major, then red, green, blue.
 fn higher_degrees(colour: &Element, sh_degree: u8) -> Result<Vec<Property>, IngestError> {
-    let rest = 1..sh::coefficients(sh_degree);
-    let rest = rest.flat_map(|k| (0..3).map(move |c| Field::Sh(k, c)));
-    rest.map(|field| colour.property(&file_name(field, sh_degree)).cloned()).collect()
+    let fields =
+        (1..sh::coefficients(sh_degree)).flat_map(|k| (0..3).map(move |c| Field::Sh(k, c)));
+    fields.map(|field| colour.property(&file_name(field, sh_degree)).cloned()).collect()
 }
 
 /// The tables chunk, vertex, and (if there is one) sh, in that order and of matching lengths.

@@ -8,7 +8,7 @@ use std::io::{BufRead, Read};
 use crate::ingest::IngestError;
 use crate::limits;
 
-/// A parsed header.
+/// What the lines up to `end_header` say.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Header {
     /// How the numbers of the body are written.

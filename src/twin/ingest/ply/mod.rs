@@ -69,8 +69,10 @@ pub(super) fn read(
     let mut bad_filters = BTreeMap::new();
     for element in &header.elements {
         body.rows(element, |row| {
+            // Other elements are read only to pass over their rows.
             if element.name == vertex.name {
                 let bad = columns.filter(row).filter(|filter| !filter.is_finite());
+                // Only as many as an error names.
                 if let Some(bad) = bad.filter(|_| bad_filters.len() < NAMED_BAD_GAUSSIANS) {
                     bad_filters.insert(gaussians.len(), bad);
                 }
@@ -124,6 +126,7 @@ pub(super) fn read_points(
                 if !at.iter().all(|value| value.is_finite()) {
                     faulty.get_or_insert((points.len(), at));
                 }
+                // The cast saturates, so that values beyond 255 are full brightness.
                 let rgb8 = colors.map(|color| color.map_or(128, |color| color.value(row) as u8));
                 points.push(CapturePoint { at, rgb8 });
             }

@@ -19,6 +19,7 @@ const MOST_ROUNDING_M: f64 = 1e-4;
 pub fn write_ply(gaussians: &Gaussians, out: &mut impl Write) -> io::Result<()> {
     let rest = 3 * (sh::coefficients(gaussians.sh_degree) - 1);
     let rounding = |m: &f64| (*m - f64::from(*m as f32)).abs();
+    // From about 2 km on, f32 rounds by more than this.
     let is_far = gaussians.means_m.iter().flatten().any(|m| rounding(m) > MOST_ROUNDING_M);
     let of_mean = if is_far { "double" } else { "float" };
     writeln!(out, "ply\nformat binary_little_endian 1.0\nelement vertex {}", gaussians.len())?;

@@ -16,7 +16,7 @@ pub(super) struct NamedFile {
     pub(super) bytes: Vec<u8>,
 }
 
-/// A decoded image.
+/// The pixels of a decoded WebP file, row by row.
 pub(super) struct Image {
     bytes: Vec<u8>,
     /// Bytes of a pixel: 3, or 4 with alpha.
@@ -97,6 +97,7 @@ impl Palette {
         budget: &mut UnpackBudget,
     ) -> Result<Self, IngestError> {
         let name = file.name.clone();
+        // Its pixels are entries and not Gaussians: their number is checked below.
         let image = Image::decode(file, 0, budget)?;
         let [width_px, height_px] = image.size_px;
         let wide = |d: &u8| ENTRIES_PER_ROW * (sh::coefficients(*d) - 1) == width_px;
@@ -123,6 +124,7 @@ impl Palette {
         if label >= self.entries {
             return None;
         }
+        // 64 entries fill a row exactly, so that each entry is one run of pixels.
         let start = label * self.coefficients * stride;
         let pixels = &self.image.bytes[start..start + self.coefficients * stride];
         Some(pixels.chunks_exact(stride).flat_map(|pixel| [pixel[0], pixel[1], pixel[2]]))

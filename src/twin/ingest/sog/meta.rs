@@ -126,8 +126,10 @@ impl Tables {
                 Ok(Self {
                     count: meta.count.ok_or("there is no count")?,
                     means,
+                    // All three axes share one codebook, and so do all three channels.
                     scales: [codebook("scales", &meta.scales.codebook)?; 3],
                     colours: [codebook("sh0", &meta.sh0.codebook)?; 3],
+                    // Alpha is the opacity itself in this version.
                     logits: std::array::from_fn(|byte| activation::logit(byte as f64 / 255.0)),
                     higher: higher.transpose()?,
                 })

@@ -83,7 +83,8 @@ fn read_one(
         let bytes = parts.read(&file, limits::SCENE_PART_BYTES)?;
         Ok(NamedFile { name: file, bytes })
     };
-    let [means_l, means_u] = [fetch(&meta.means.files.0)?, fetch(&meta.means.files.1)?];
+    let means_l = fetch(&meta.means.files.0)?;
+    let means_u = fetch(&meta.means.files.1)?;
     let scales = fetch(&meta.scales.files.0)?;
     let quats = fetch(&meta.quats.files.0)?;
     let sh0 = fetch(&meta.sh0.files.0)?;
@@ -94,17 +95,20 @@ fn read_one(
     let mut decode = |file: NamedFile| Image::decode(file, count, parts.budget());
 
     // Centres: 16 bits between mins and maxs, of the signed logarithm.
-    let [low, high] = [decode(means_l)?, decode(means_u)?];
+    let low = decode(means_l)?;
+    let high = decode(means_u)?;
     let mut gaussians = Gaussians { means_m: Vec::with_capacity(count), ..Gaussians::default() };
     for (low, high) in low.pixels(count).zip(high.pixels(count)) {
         let mean = std::array::from_fn(|axis| {
             let unit = f64::from(u16::from_le_bytes([low[axis], high[axis]])) / 65535.0;
             let [least, most] = tables.means[axis];
             let logarithm = least + (most - least) * unit;
+            // The inverse of sign(x) ln(1 + |x|). `exp_m1` keeps the digits of small values.
             logarithm.signum() * logarithm.abs().exp_m1()
         });
         gaussians.means_m.push(mean);
     }
+    // Freed before the other images are decoded, which take as much memory.
     drop([low, high]);
 
     // Rotations, scales, and opacities.
@@ -115,6 +119,7 @@ fn read_one(
                 format!("Gaussian {index}: alpha is {largest}; 252 to 255 name a component");
             return Err(body(&meta.quats.files.0, reason));
         }
+        // The three smaller components of a unit quaternion lie within ±√½.
         let others = [r, g, b].map(|byte| (f64::from(byte) / 255.0 - 0.5) * 2f64.sqrt());
         let largest = usize::from(largest - 252);
         gaussians.quats_wxyz.push(activation::quat_of_smallest_three(largest, others));
@@ -148,6 +153,7 @@ fn read_one(
                 gaussians.sh.extend(bytes.map(|byte| pick(&table.values, byte)));
             }
         }
+        // Without shN the scene is of degree 0, of which this is all.
         _ => gaussians.sh.extend(colours.pixels(count).flat_map(dc)),
     }
     Ok(gaussians)

@@ -58,6 +58,7 @@ pub(super) fn read(
     if let Some(version) = meta.version.filter(|&version| version != 1) {
         return Err(bad(NAME, format!("version {version}; 1, with or without a number, is read")));
     }
+    // Each file of a scene is read once, so that a repeated name could not be read.
     let mut names = BTreeSet::new();
     if let Some(twice) = meta.filenames.iter().find(|name| !names.insert(name.as_str())) {
         return Err(bad(NAME, format!("file {twice:?} is named twice")));
@@ -67,6 +68,7 @@ pub(super) fn read(
     let total = places.values().flatten().map(|place| u128::from(place.count)).sum::<u128>();
     check_count(u64::try_from(total).unwrap_or(u64::MAX))?;
     let mut all = Gaussians::default();
+    // File by file, so that each is decoded once and one block at a time is in memory.
     for (file, places) in places {
         let block = read_block(&meta.filenames[file], folder, parts, reading)?;
         for FileRange { offset, count, .. } in places {
@@ -94,6 +96,7 @@ fn ranges_by_file(
 ) -> Result<BTreeMap<usize, Vec<FileRange>>, IngestError> {
     let mut places: BTreeMap<usize, Vec<FileRange>> = BTreeMap::new();
     let mut levels = BTreeSet::new();
+    // Without recursion, because the depth of the tree is up to the file.
     let mut nodes = vec![&meta.tree];
     while let Some(node) = nodes.pop() {
         nodes.extend(&node.children);

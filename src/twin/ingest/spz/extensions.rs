@@ -25,12 +25,14 @@ pub(super) fn read(
     mut left: u64,
     reading: &mut Reading,
 ) -> Result<(), IngestError> {
+    // A head takes 8 bytes. Fewer than that are no extension.
     while let Some(after) = left.checked_sub(8) {
         let mut head = [0; 8];
         input.read_exact(&mut head)?;
         let [kind, bytes] = head.as_chunks().0 else { return Ok(()) };
         let [kind, bytes] = [*kind, *bytes].map(u32::from_le_bytes);
         left = after;
+        // With a wrong length, the place of the next extension is lost as well.
         if u64::from(bytes) > left {
             reading.warn(format!(
                 "SPZ extension {kind:#010x} says {bytes} bytes of {left}: it and what follows are not read"
@@ -52,6 +54,7 @@ pub(super) fn read(
             }
         }
     }
+    // The caller reads on from the end of the extensions.
     skip(input, left)
 }
 

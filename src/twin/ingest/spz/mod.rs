@@ -51,6 +51,8 @@ pub(super) fn read(
     let count = header.count;
     let attributes = header.attributes();
     if header.version < 4 {
+        // Before version 4 the file is not compressed here, so that its size must be exact. Only
+        // extensions, whose size is not recorded, may follow.
         let promised = u128::from(HEADER_BYTES) + header.body_bytes();
         let held = u128::from(file_bytes);
         if header.flags & FLAG_EXTENSIONS == 0 && promised != held || promised > held {
@@ -70,9 +72,12 @@ pub(super) fn read(
     let rows = |attribute: usize, take: &mut dyn FnMut(&[u8])| {
         let attribute = &attributes[attribute];
         let broken = |error: io::Error| attribute.broken(&error);
+        // Bounded by the table, so that a stream cannot read on into the next one.
         let mut packed = (&mut input).take(streams[attribute.index]);
         let mut stream = zstd::Decoder::with_buffer(&mut packed).map_err(broken)?.single_frame();
         attribute.rows(&mut stream, take)?;
+        // A byte more in the decoded stream, or one of the packed stream that was not used,
+        // contradicts the table.
         let more = stream.read(&mut [0]).map_err(broken)? + packed.read(&mut [0])?;
         if more > 0 {
             return Err(body(attribute.name, "the stream is longer than its table says".into()));
@@ -107,6 +112,7 @@ pub(super) fn read_gzip_within(
         return Err(bad("bytes 4 to 7", reason));
     }
     let unpacked_bytes = u128::from(HEADER_BYTES) + header.body_bytes();
+    // Checked before decoding: a small gzip stream may unpack to a thousand times its size.
     budget.unpack(FORMAT, "the gzip stream", unpacked_bytes)?;
     header.note_flags(reading);
     let attributes = header.attributes();
@@ -119,18 +125,21 @@ pub(super) fn read_gzip_within(
     let damaged = |e: io::Error| body("the end", format!("the gzip stream is damaged: {e}"));
     let mut after = Vec::new();
     if header.flags & FLAG_EXTENSIONS != 0 {
+        // An extension is read from memory, and only up to what a legacy file may hold.
         let kept = limit.min(extensions::LEGACY_BYTES);
         (&mut input).take(kept).read_to_end(&mut after).map_err(damaged)?;
         extensions::read(&mut &after[..], after.len() as u64, reading)?;
     }
     extensions::assume_system(reading);
     let left = limit - (after.len() as u64).min(limit);
-    let more = io::copy(&mut (&mut input).take(left), &mut io::sink());
-    let more = more.map_err(damaged)? + after.len() as u64;
+    let rest = io::copy(&mut (&mut input).take(left), &mut io::sink()).map_err(damaged)?;
+    let more = rest + after.len() as u64;
     if more > 0 && header.flags & FLAG_EXTENSIONS == 0 {
         let reason = format!("more than the {unpacked_bytes} bytes that the header promises");
         return Err(body("the end", reason));
     }
+    // After `limit` bytes the end of the stream may not be reached, and bytes that are left are no
+    // fault.
     if more < limit && !input.into_inner().fill_buf()?.is_empty() {
         return Err(body("the end", "more than the gzip stream: copy the file again".into()));
     }
@@ -188,6 +197,7 @@ impl Header {
 
     /// The attributes in the order of the file.
     fn attributes(&self) -> Vec<Attribute> {
+        // Version 2 stores x, y and z in a byte each; later ones the smallest three in 32 bits.
         let rotation_bytes = if self.version == 2 { 3 } else { 4 };
         let sh_bytes = 3 * (sh::coefficients(self.sh_degree) - 1);
         let attributes = [
@@ -198,8 +208,12 @@ impl Header {
             ("rotations", rotation_bytes),
             ("colour coefficients", sh_bytes),
         ];
-        let attributes = attributes.into_iter().enumerate().filter(|(_, (_, stride))| *stride > 0);
         attributes
+            .into_iter()
+            .enumerate()
+            // Without higher degrees a file has no stream of coefficients, and its table no entry
+            // for one.
+            .filter(|(_, (_, stride))| *stride > 0)
             .map(|(index, (name, stride))| Attribute { index, name, stride, count: self.count })
             .collect()
     }
@@ -225,6 +239,7 @@ impl Attribute {
 
     /// Calls `take` with each row.
     fn rows(&self, input: &mut dyn Read, take: &mut dyn FnMut(&[u8])) -> Result<(), IngestError> {
+        // In blocks, so that not every row costs a call of a dynamic reader.
         let mut rows = vec![0; self.stride * ROWS_AT_ONCE];
         let mut left = self.count as usize;
         while left > 0 {
@@ -260,6 +275,7 @@ fn read_table(
     reading: &mut Reading,
 ) -> Result<Vec<u64>, IngestError> {
     budget.read(file_bytes);
+    // The count of streams follows from the SH degree. Another count means another layout.
     let attributes = header.attributes();
     if usize::from(header.streams) != attributes.len() {
         let found = header.streams;
@@ -272,6 +288,8 @@ fn read_table(
     input.read_exact(&mut rest).map_err(short)?;
     let table_at = u64::from(u32::from_le_bytes([rest[0], rest[1], rest[2], rest[3]]));
     let streams_at = table_at + STREAM_ENTRY_BYTES * attributes.len() as u64;
+    // The table must lie behind the header and within the file, so that the subtractions below
+    // hold.
     if table_at < HEADER_4_BYTES || streams_at > file_bytes {
         let reason = format!("the table cannot be at {table_at} in a file of {file_bytes} bytes");
         return Err(bad("bytes 16 to 19", reason));
@@ -284,6 +302,7 @@ fn read_table(
         let sizes = entry.as_chunks::<8>().0;
         let packed_bytes = u64::from_le_bytes(sizes[0]);
         let bytes = u64::from_le_bytes(sizes[1]);
+        // Sizes that disagree with the count would shift all rows after them.
         if u128::from(bytes) != attribute.bytes() {
             let wanted = attribute.bytes();
             let count = attribute.count;
@@ -298,6 +317,7 @@ fn read_table(
         let content = format!("{} streams", packed.len());
         return Err(IngestError::Size { format: FORMAT, promised, held, content });
     }
+    // Unpacked bytes follow from the header, so the budget is charged before a stream is decoded.
     budget.unpack(FORMAT, "the zstd streams", header.body_bytes())?;
     Ok(packed)
 }
@@ -324,12 +344,15 @@ fn decode(
     let stride = 3 * sh::coefficients(header.sh_degree);
     g.sh.resize(stride * count, 0.0);
     let mut colours = g.sh.chunks_exact_mut(stride);
+    // A row has three bytes, so that `zip` fills the first three values of a Gaussian: degree 0.
     rows(2, &mut |row| {
         for (value, &byte) in colours.next().into_iter().flatten().zip(row) {
             *value = ((unit(byte) - 0.5) / COLOUR_SCALE) as f32;
         }
     })?;
     rows(3, &mut |row| {
+        // The specification stores ln(scale) as 16 (ln(scale) + 10): steps of 1/16 from -10 to
+        // 5.94.
         g.ln_scales.push(std::array::from_fn(|i| f32::from(row[i]) / 16.0 - 10.0));
     })?;
     rows(4, &mut |row| {
@@ -341,6 +364,7 @@ fn decode(
     if header.sh_degree > 0 {
         let mut colours = g.sh.chunks_exact_mut(stride);
         rows(5, &mut |row| {
+            // Coefficient 0 was set by the colours, so its three values are skipped.
             for (value, &byte) in colours.next().into_iter().flat_map(|c| &mut c[3..]).zip(row) {
                 *value = (f32::from(byte) - 128.0) / 128.0;
             }
@@ -358,6 +382,7 @@ fn quat_of_xyz(bytes: [u8; 3]) -> [f32; 4] {
 /// Version 3: the index of the largest of (x, y, z, w) in the upper 2 bits, then sign and magnitude
 /// of the others, 1 + 9 bits each, as fractions of √½.
 fn quat_of_word(word: u32) -> [f32; 4] {
+    // The fields lie from bit 29 down to bit 0, in the order of the components that are left.
     let others = [20, 10, 0].map(|shift| {
         let bits = word >> shift;
         let magnitude = f64::from(bits & 0x1ff) / f64::from(0x1ff) * 0.5f64.sqrt();

@@ -19,7 +19,7 @@ pub(super) struct ReadActors {
     unread: Vec<UnlistedObjects>,
 }
 
-/// One asset.
+/// What reading one listed asset gave.
 enum ReadActor {
     Whole(StoredActor),
     Damaged(DamagedActor),

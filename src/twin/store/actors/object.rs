@@ -50,6 +50,7 @@ impl Catalog {
     ) -> Result<(Header, Vec<u8>), StoreError> {
         let mut content = Vec::new();
         let mut levels = Vec::with_capacity(asset.levels.len());
+        // Degree and classes are those of level 0, and the header has them once for all levels.
         let sh_degree = asset.levels.first().map_or(0, |level| level.chunk.sh_degree());
         let classes = asset.levels.first().is_some_and(|level| level.chunk.classes().is_some());
         for (index, AssetLevel { error_m, chunk }) in asset.levels.iter().enumerate() {
@@ -114,6 +115,8 @@ impl Header {
             return Err(format!("SH degree is {}, not 0 to 3", self.sh_degree));
         }
         let first = self.levels.first().ok_or("it has no levels")?;
+        // The counts fall from level to level, which is checked below, so that this bounds all of
+        // them.
         if first.count as usize > ActorAsset::MOST_GAUSSIANS {
             return Err(format!("{} Gaussians are too many for an actor", first.count));
         }
@@ -128,15 +131,16 @@ impl Header {
         let mut levels = Vec::with_capacity(self.levels.len());
         for (index, level) in self.levels.iter().enumerate() {
             let of_level = |reason: String| format!("level {index}: {reason}");
-            let own = rest.get(..level.bytes as usize);
-            let own = own.ok_or_else(|| of_level("it ends before its last byte".to_owned()))?;
+            let own = rest
+                .get(..level.bytes as usize)
+                .ok_or_else(|| of_level("it ends before its last byte".to_owned()))?;
             // Levels follow each other without gaps: what is left after the last one is damage.
             rest = &rest[own.len()..];
             let (entry, section) = section(level, self.classes);
-            let (degree, record) = (self.sh_degree, self.record);
-            let chunk = chunk_file::unpack(own, &entry, &section, degree, record, None);
-            let chunk = Arc::new(chunk.map_err(of_level)?);
-            levels.push(AssetLevel { error_m: level.error_m, chunk });
+            let chunk =
+                chunk_file::unpack(own, &entry, &section, self.sh_degree, self.record, None)
+                    .map_err(of_level)?;
+            levels.push(AssetLevel { error_m: level.error_m, chunk: Arc::new(chunk) });
         }
         if rest.is_empty() {
             Ok(levels)

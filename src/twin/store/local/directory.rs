@@ -26,7 +26,7 @@ pub(in crate::store) struct Local {
     pub(super) disk: Arc<dyn Disk>,
 }
 
-/// An object's file.
+/// The open file of an object, whose size is known but whose content is not yet checked.
 pub(super) struct OpenObject {
     pub(super) path: PathBuf,
     pub(super) file: Box<dyn ReadFile>,

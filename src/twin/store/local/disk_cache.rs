@@ -123,8 +123,11 @@ impl DiskCache {
     /// before the next call. One process at a time does this; concurrent callers return at once.
     fn make_room(&self) -> Result<(), StoreError> {
         let path = self.dir.join("lock");
-        let lock = File::options().create(true).append(true).open(&path);
-        let lock = lock.map_err(StoreError::io("create", &path))?;
+        let lock = File::options()
+            .create(true)
+            .append(true)
+            .open(&path)
+            .map_err(StoreError::io("create", &path))?;
         // Another process or thread is freeing space.
         if lock.try_lock().is_err() {
             return Ok(());

@@ -148,7 +148,6 @@ pub(super) fn sync_parent(disk: &dyn Disk, path: &Path) -> Result<(), StoreError
     path.parent().map_or(Ok(()), |dir| sync(disk, dir))
 }
 
-/// Syncs a directory.
 pub(super) fn sync(disk: &dyn Disk, dir: &Path) -> Result<(), StoreError> {
     disk.sync_dir(dir).map_err(StoreError::io("sync", dir))
 }

@@ -173,6 +173,7 @@ impl ObjectBackend for Local {
         // The log decides which objects are removed.
         self.settle(name)?;
         // The staging directories are removed last: while they exist, the next start tries again.
+        // Without the list of what versions name, no object is removed.
         if let Some(named) = named() {
             self.remove_unnamed(name, &named)?;
         }
@@ -195,6 +196,7 @@ impl ObjectBackend for Local {
         let id = uuid::Uuid::now_v7().as_simple().to_string();
         let aside = path.with_extension(format!("damaged-{id}"));
         self.disk.rename(&path, &aside).map_err(StoreError::io("rename", &path))?;
+        // Durable before it is reported: the record must not come back after a power cut.
         sync_parent(&*self.disk, &path)?;
         Ok(aside)
     }
@@ -264,6 +266,7 @@ impl ObjectBackend for Local {
                 Err(error) if error.kind() == ErrorKind::NotFound => {}
                 removed => removed.map_err(StoreError::io("remove", &dir))?,
             }
+            // Folder by folder, so that after a power cut the log is never gone before the objects.
             sync(&*self.disk, &twin)?;
         }
         self.disk.remove_dir(&twin).map_err(StoreError::io("remove", &twin))?;

@@ -18,6 +18,7 @@ impl Disk for RealDisk {
     fn list(&self, dir: &Path) -> io::Result<Vec<String>> {
         let mut names = Vec::new();
         for entry in fs::read_dir(dir)? {
+            // Names that are not UTF-8 are none of the store's, and are left out.
             names.extend(entry?.file_name().into_string());
         }
         Ok(names)
@@ -25,6 +26,7 @@ impl Disk for RealDisk {
 
     fn info(&self, path: &Path) -> io::Result<FileInfo> {
         let found = fs::symlink_metadata(path)?;
+        // A time before 1970 counts as 1970.
         let since = found.modified()?.duration_since(UNIX_EPOCH).unwrap_or_default();
         Ok(FileInfo {
             bytes: found.len(),

@@ -122,11 +122,15 @@ impl Remote {
                 found.bytes().await.map(Vec::from)
             }
         };
-        let read = self.runner.start(retry, request).wait();
-        let read = read.map_err(StoreError::io("read", &self.root.join(key)));
+        let read = self
+            .runner
+            .start(retry, request)
+            .wait()
+            .map_err(StoreError::io("read", &self.root.join(key)));
         let short = match &read {
             Ok(part) => (part.len() as u64) < bytes.end - bytes.start,
             Err(StoreError::Io { cause, .. }) => cause.kind() == ErrorKind::Other,
+            // Other kinds, such as a missing object, say enough by themselves.
             Err(_) => false,
         };
         // Stores differ in how they answer a range past the end: with fewer bytes, or with an

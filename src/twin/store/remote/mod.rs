@@ -49,6 +49,7 @@ impl ObjectBackend for Remote {
         })?;
         // A store has no folders: it returns what keys have in front of the next slash.
         let folders = listed.common_prefixes.iter().filter_map(|key| key.filename());
+        // Other folders below the prefix are no twins.
         let mut names: Vec<String> =
             folders.filter(|name| is_name(name)).map(str::to_owned).collect();
         names.sort_unstable();
@@ -182,6 +183,7 @@ impl ObjectBackend for Remote {
     }
 
     fn unfinished_commits(&self) -> Result<Vec<String>, StoreError> {
+        // Commits upload to the final keys, so that there is no staging that could be left.
         Ok(Vec::new())
     }
 
@@ -190,6 +192,7 @@ impl ObjectBackend for Remote {
         _name: &str,
         _named: &dyn Fn() -> Option<BTreeSet<String>>,
     ) -> Result<(), StoreError> {
+        // Only garbage collection finds what a killed commit has uploaded.
         Ok(())
     }
 

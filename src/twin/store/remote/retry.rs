@@ -94,6 +94,7 @@ impl RequestRunner {
     }
 
     pub(super) fn traffic(&self) -> Traffic {
+        // Relaxed, because the counts are only reported and order no other memory.
         let [requests, retries, failures] =
             [0, 1, 2].map(|i: usize| self.counts[i].load(Ordering::Relaxed));
         Traffic { requests, retries, failures, ..Traffic::default() }
@@ -166,6 +167,7 @@ impl RequestRunner {
     ) -> PendingRequest<T> {
         // Room for one result, so that the task never waits for the caller.
         let (send, receive) = mpsc::sync_channel(1);
+        // There is one until the drop. Without it, the dropped sender makes `wait` fail.
         if let Some(runtime) = &self.runtime {
             runtime.spawn(async move {
                 // Sending fails if the caller no longer waits.

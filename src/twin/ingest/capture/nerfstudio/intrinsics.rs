@@ -83,6 +83,8 @@ impl Intrinsics {
     /// # Errors
     /// Both have a field of the camera, with different values.
     pub(super) fn joined_with(&self, frame: Self) -> Result<Self, Wrong> {
+        // A conflict is refused and not resolved: each choice would train wrongly with one of the
+        // two programs.
         for field in OF_CAMERA {
             let of_file = self.0.get(field).filter(|value| !value.is_null());
             let of_frame = frame.0.get(field).filter(|value| !value.is_null());
@@ -95,6 +97,8 @@ impl Intrinsics {
                 return Err(Wrong { field, reason });
             }
         }
+        // The frame's fields replace those of the file. Those of the camera are equal where both
+        // exist.
         let mut fields = self.0.clone();
         fields.extend(frame.0.into_iter().filter(|(_, value)| !value.is_null()));
         Ok(Self(fields))
@@ -114,6 +118,7 @@ impl Intrinsics {
         let width = self.side("w")?;
         let height = self.side("h")?;
         let [fx, fy] = self.focal_px(f64::from(width), f64::from(height))?;
+        // The middle of the image, counted in pixels whose first one has its middle at 0.5.
         let cx = self.number("cx")?.unwrap_or(0.5 * f64::from(width));
         let cy = self.number("cy")?.unwrap_or(0.5 * f64::from(height));
         let camera = Camera {
@@ -133,6 +138,7 @@ impl Intrinsics {
     /// both.
     fn focal_px(&self, width: f64, height: f64) -> Result<[f64; 2], Wrong> {
         let along = |side: f64, fl: &'static str, angle: &'static str, fov: &'static str| {
+            // Half the side is the tangent of half the angle of view times the focal length.
             let of_angle = |angle_rad: f64| 0.5 * side / (0.5 * angle_rad).tan();
             let of_fov = self.number(fov)?.map(|degrees| of_angle(degrees.to_radians()));
             let given = match self.number(fl)? {
@@ -140,6 +146,8 @@ impl Intrinsics {
                 None => self.number(angle)?.map(of_angle),
             };
             match (given, of_fov) {
+                // 0.1 % leaves room for angles that exporters round. Beyond it the fields describe
+                // two cameras.
                 (Some(given), Some(of_fov)) if (given / of_fov - 1.0).abs() > 1e-3 => {
                     let reason = format!(
                         "says a focal length of {of_fov:.2}, and {fl} or {angle} {given:.2}"
@@ -152,6 +160,7 @@ impl Intrinsics {
         let x = along(width, "fl_x", "camera_angle_x", "x_fov")?;
         let y = along(height, "fl_y", "camera_angle_y", "y_fov")?;
         match (x, y) {
+            // Square pixels are the rule: one focal length holds for both axes.
             (Some(x), y) => Ok([x, y.unwrap_or(x)]),
             (None, Some(y)) => Ok([y, y]),
             (None, None) => {
@@ -180,6 +189,8 @@ impl Intrinsics {
         };
         let Distortion { k, p } = self.distortion()?;
         match model {
+            // The flag is instant-ngp's and the model is nerfstudio's: they must name the same
+            // lens.
             Some(model) if is_ngp_fisheye && !FISHEYE.contains(&model) => {
                 let reason =
                     format!("is true, and camera_model is {model:?}: remove one of the two");
@@ -202,6 +213,8 @@ impl Intrinsics {
     fn distortion(&self) -> Result<Distortion, Wrong> {
         let field = "distortion_params";
         let or_zero = |name| self.number(name).map(Option::unwrap_or_default);
+        // The list stands in the place of the single fields, which may repeat it but not differ
+        // from it.
         match self.0.get(field) {
             None | Some(Value::Null) => Ok(Distortion {
                 k: [or_zero("k1")?, or_zero("k2")?, or_zero("k3")?, or_zero("k4")?],
@@ -241,6 +254,7 @@ impl Intrinsics {
 
     fn side(&self, field: &'static str) -> Result<u32, Wrong> {
         let side = self.number(field)?;
+        // JSON numbers may be floats: 1920.0 is a size, and 1920.5 is none.
         let usable = side.filter(|side| side.fract() == 0.0 && (1.0..=1e6).contains(side));
         usable.map(|side| side as u32).ok_or_else(|| {
             let given = side.map_or("is missing".to_owned(), |side| format!("is {side:?}"));
@@ -258,6 +272,7 @@ fn is_same(a: &Value, b: &Value) -> bool {
         (Value::Array(a), Value::Array(b)) => {
             a.len() == b.len() && a.iter().zip(b).all(|(a, b)| is_same(a, b))
         }
+        // serde_json tells 700 from 700.0, which are the same number to every reader.
         (Value::Number(_), Value::Number(_)) => a.as_f64() == b.as_f64(),
         _ => a == b,
     }
@@ -287,6 +302,7 @@ fn perspective([k1, k2, k3, k4]: [f64; 4], p: [f64; 2]) -> Result<Lens, Wrong> {
 }
 
 fn fisheye(k: [f64; 4], p: [f64; 2]) -> Result<Lens, Wrong> {
+    // The fisheye lens here has no tangential terms, and to ignore them would bend the picture.
     for (field, value) in [("p1", p[0]), ("p2", p[1])] {
         if value != 0.0 {
             let reason = format!(

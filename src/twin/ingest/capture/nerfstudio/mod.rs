@@ -76,6 +76,7 @@ pub struct NerfstudioCapture {
 /// The error names the file, the line or the field, and what to do.
 pub fn read(path: &Path) -> Result<NerfstudioCapture, CaptureError> {
     let inside = path.join("transforms.json");
+    // Programs differ in whether they take the folder or the file, so both are accepted.
     let path = if path.is_dir() { inside.as_path() } else { path };
     let text = read_whole(path, limits::CAPTURE_BYTES)
         .map_err(|cause| CaptureError::File { path: path.to_owned(), cause })?;
@@ -92,6 +93,7 @@ pub fn read(path: &Path) -> Result<NerfstudioCapture, CaptureError> {
     let warnings = warnings(&file);
     let frames = file.frames.into_iter().enumerate();
     let read = |(index, mut frame): (usize, Frame)| {
+        // Taken out of the frame, because `posed` consumes the rest of it.
         let mask = frame.mask_path.take();
         let depth = frame.depth_file_path.take();
         let exposure_stops = frame.exposure_stops;
@@ -117,6 +119,7 @@ fn warnings(file: &Transforms) -> Vec<String> {
     let has = |field: &str| {
         file.intrinsics.has(field) || file.frames.iter().any(|frame| frame.intrinsics.has(field))
     };
+    // With times for all frames, the fields in other units are only a duplicate.
     let is_timed = file.frames.iter().all(|frame| frame.time_us.is_some());
     let mut warnings = Vec::new();
     for field in ["timestamp", "timestamps", "time"] {
@@ -145,6 +148,7 @@ fn posed(
     let wrong = |field: &str, reason: String| CaptureError::at(path, at(field), reason);
     let matrix = |reason: &str| wrong("transform_matrix", reason.to_owned());
     let rows = &frame.transform_matrix;
+    // nerfstudio writes 4 rows, and some exporters leave out the constant last one.
     let is_matrix = (3..=4).contains(&rows.len()) && rows.iter().all(|row| row.len() == 4);
     if !is_matrix {
         return Err(matrix("expected 4 rows of 4 numbers: world_from_camera"));
@@ -155,7 +159,10 @@ fn posed(
         ));
     }
     let row = |at: usize| DVec3::new(rows[at][0], rows[at][1], rows[at][2]);
+    // The rows are those of the matrix, and glam takes columns.
     let world_from_opengl = DMat3::from_cols(row(0), row(1), row(2)).transpose();
+    // From OpenGL's camera (y up, z backwards) to this program's (y down, z forward): a half turn
+    // about x, which negates the second and the third column.
     let rotation =
         to_rotation(world_from_opengl * DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0)));
     let Some(rotation) = rotation else {
@@ -168,8 +175,10 @@ fn posed(
     let position = [rows[0][3], rows[1][3], rows[2][3]];
     let world_from_camera =
         Pose::checked(position, q_wxyz).map_err(|cause| matrix(&cause.to_string()))?;
-    let camera = shared.joined_with(frame.intrinsics).and_then(|fields| fields.camera());
-    let camera = camera.map_err(|Wrong { field, reason }| wrong(field, reason))?;
+    let camera = shared
+        .joined_with(frame.intrinsics)
+        .and_then(|fields| fields.camera())
+        .map_err(|Wrong { field, reason }| wrong(field, reason))?;
     let time_us = match frame.time_us {
         None | Some(Value::Null) => None,
         Some(time) => Some(time.as_i64().ok_or_else(|| {
