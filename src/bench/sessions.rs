@@ -122,6 +122,7 @@ impl Sessions {
             .collect();
         let mut drivers = Vec::new();
         for number in 0..count {
+            // Spread evenly: at one place all sessions would need the same parts of the twin.
             let at = poses.len() * number as usize / count as usize;
             let name = format!("bench-{number}");
             let options = self.options(manifest)?;
@@ -140,6 +141,8 @@ impl Sessions {
         for task in tasks {
             steps.extend(task.await??);
         }
+        // Measured to the end of the last step, which may be after `end`: all its steps are
+        // counted.
         let took = begun.elapsed();
         let processor = processor_time()?.saturating_sub(processor_before);
         anyhow::ensure!(!steps.is_empty(), "no step ended within {} s", self.seconds);

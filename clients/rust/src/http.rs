@@ -120,6 +120,7 @@ impl HttpClient {
 
         let tls = match server.scheme() {
             "https" => tls::client_config(&options.root_certificates_pem),
+            // Without TLS a system without root certificates must not fail.
             _ => tls::no_roots_config(),
         };
         let http = reqwest::Client::builder()
@@ -128,6 +129,7 @@ impl HttpClient {
             .connect_timeout(limits::HTTP_CONNECT_TIMEOUT)
             .http1_only()
             .pool_max_idle_per_host(0)
+            // The protocol has no redirections: following one would send a scene to another host.
             .redirect(Policy::none())
             .no_proxy()
             .build()
@@ -258,6 +260,7 @@ impl HttpClient {
     fn url(&self, path: &[&str]) -> Url {
         let mut url = self.server.clone();
         if let Ok(mut segments) = url.path_segments_mut() {
+            // Segments are escaped one by one: a name cannot add a slash to the path.
             segments.clear().extend(path);
         }
         url
@@ -270,6 +273,7 @@ impl HttpClient {
         time_limit: Duration,
     ) -> Result<Vec<u8>, HttpError> {
         let no_answer = |error: reqwest::Error| {
+            // Connecting has a limit of its own, which is not `time_limit`.
             if error.is_timeout() && !error.is_connect() {
                 self.no_answer(&format!("none within {time_limit:?}"))
             } else {
@@ -280,6 +284,7 @@ impl HttpClient {
         let status = response.status();
         let mut body = Vec::new();
         while let Some(chunk) = response.chunk().await.map_err(no_answer)? {
+            // The length that the answer announces is not trusted: it may be absent or wrong.
             if body.len() + chunk.len() > limits::HTTP_ANSWER_BYTES {
                 let limit = limits::HTTP_ANSWER_BYTES;
                 return Err(self.unreadable(&format!("it is larger than {limit} bytes")));
@@ -321,6 +326,7 @@ fn parse_server(text: &str) -> Option<Url> {
 
 /// Describes an error with its causes: the error itself only says that a request failed.
 fn describe(error: reqwest::Error) -> String {
+    // The message of `no_answer` names the server already.
     let error = error.without_url();
     let mut causes = Vec::new();
     let mut source = error.source();
@@ -338,6 +344,7 @@ fn refused(status: StatusCode, body: &[u8]) -> HttpError {
             HttpError::Refused { status, code: Some(code), message, cells, offset }
         }
         Err(_) => {
+            // Not of this protocol: a proxy answers with a page, of which the beginning is enough.
             let message = String::from_utf8_lossy(&body[..body.len().min(200)]).into_owned();
             HttpError::Refused { status, code: None, message, cells: Vec::new(), offset: None }
         }

@@ -127,6 +127,8 @@ pub fn decode<T: Inbound>(text: &str) -> Result<T, Refused> {
         },
     };
     let refused = |mistake| Refused { seq: walk::seq(&tree), mistake };
+    // From here on integers are written as their types need them, so that serde reads `1e5` as
+    // well.
     let value = walk::checked(T::shapes(), &tree).map_err(refused)?;
     serde_json::from_value(value).map_err(|error| {
         let reason = format!("the schema accepts what the type does not: {error}");

@@ -116,6 +116,7 @@ impl Cars {
 /// oncoming lane.
 fn places(drive: &Trajectory, count: u32) -> anyhow::Result<Vec<Pose>> {
     let rows = count.div_ceil(2);
+    // The row in the ego's lane has a gap around the middle, of FREE_M to both sides.
     let needed_m = f64::from(rows) * SPACING_M + 2.0 * FREE_M;
     let length_m = drive.length_m();
     anyhow::ensure!(
@@ -125,6 +126,7 @@ fn places(drive: &Trajectory, count: u32) -> anyhow::Result<Vec<Pose>> {
     let place = |index: u32| {
         let from_middle_m = (f64::from(index / 2) - 0.5 * f64::from(rows - 1)) * SPACING_M;
         let from_ahead = index % 2 == 1;
+        // Away from the middle, where the ego drives.
         let free_m = if from_ahead { 0.0 } else { FREE_M.copysign(from_middle_m) };
         let station_m = 0.5 * length_m + from_middle_m + free_m;
         let beside = if from_ahead {
@@ -165,6 +167,7 @@ fn halve(gaussians: &mut Gaussians, index: usize) {
     let rotation = DQuat::from_xyzw(x, y, z, w).normalize();
     let [share, beside] = HALF;
     let along_m = rotation * DVec3::AXES[axis] * (beside * f64::from(scales[axis]).exp());
+    // Scales are stored as logarithms: a product becomes a sum.
     gaussians.ln_scales[index][axis] += share.ln() as f32;
     let middle_m = DVec3::from_array(gaussians.means_m[index]);
     let one = gaussians.select([index]);

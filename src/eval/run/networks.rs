@@ -58,12 +58,14 @@ impl Networks {
         counts: Option<&[bool]>,
     ) -> anyhow::Result<Option<f64>> {
         let Some(network) = &self.lpips else { return Ok(None) };
+        // A copy: other measures need the pixels as they were rendered.
         let mut pixels = image.to_vec();
         for (pixel, _) in counts.into_iter().flatten().enumerate().filter(|(_, counts)| !**counts) {
             pixels[3 * pixel..3 * pixel + 3].copy_from_slice(&truth[3 * pixel..3 * pixel + 3]);
         }
         let values = network.run(&sized(size_px, pixels), Some(&sized(size_px, truth.to_vec())))?;
         ensure!(
+            // Networks are files of the user, and may compute something else.
             values.len() == 1,
             "--lpips: the network gave {} values; a distance is one",
             values.len()
