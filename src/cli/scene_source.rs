@@ -88,6 +88,7 @@ fn shot(
     changes: &LoadedProfile,
 ) -> anyhow::Result<Shot> {
     let ListedCamera { name, camera, world_from_camera, near, .. } = camera;
+    // The list overrides the scene, and the command line overrides both.
     profile.near = near.unwrap_or(profile.near);
     let profile = changes.apply(profile).with_context(|| format!("camera {name:?}"))?;
     Ok(Shot { name, view: View::new(camera, world_from_camera), profile })

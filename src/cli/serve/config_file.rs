@@ -41,10 +41,13 @@ pub(super) struct Resolved {
 /// # Errors
 /// The file cannot be read, has an unknown key or a value that the option refuses.
 pub(super) fn resolve(arguments: Vec<OsString>) -> anyhow::Result<Resolved> {
+    // Parsed once to find the file, and to report mistakes of the command line before those of the
+    // file.
     let flags = command().try_get_matches_from(&arguments)?;
     let matches = match flags.get_one::<PathBuf>("config") {
         Some(path) => {
             let mut all = read(path).with_context(|| format!("--config {}", path.display()))?;
+            // After those of the file: of an option that is given twice, the last one holds.
             all.extend(arguments);
             command().try_get_matches_from(all)?
         }
@@ -132,6 +135,7 @@ fn nearest(wrong: &str, keys: impl Iterator<Item = String>) -> String {
     let wrong_name = name(wrong);
     let distance = |key: &String| {
         let edits = strsim::damerau_levenshtein(&wrong_name, &name(key));
+        // Of two names that are equally near, the one in the same table.
         let is_other_table = key.contains('.') != wrong.contains('.');
         (edits, is_other_table)
     };
@@ -194,6 +198,7 @@ fn literal(text: &str) -> Value {
     let parsed = format!("x = {text}").parse::<Table>().ok().and_then(|mut one| one.remove("x"));
     match parsed {
         Some(scalar @ (Value::Integer(_) | Value::Float(_) | Value::Boolean(_))) => scalar,
+        // What is not a number or a boolean of TOML is a text, also a date.
         _ => Value::String(text.to_owned()),
     }
 }

@@ -97,6 +97,8 @@ mod otlp {
                 "{}: expected a URL, as http://127.0.0.1:4318",
                 cannot()
             );
+            // The exporter takes an endpoint as it is: the path of the specification is added if
+            // there is none.
             let url = if host.trim_end_matches('/').contains('/') {
                 endpoint.to_owned()
             } else {
@@ -121,6 +123,8 @@ mod otlp {
                 .with_tracer(provider.tracer("wildcity"))
                 .with_location(false)
                 .with_threads(false)
+                // Spans of libraries, also those of the exporter's own requests, would be traced
+                // without end.
                 .with_filter(filter_fn(is_own_span));
             Ok((Self(provider), layer))
         }

@@ -240,6 +240,7 @@ impl Serve {
             // An unknown or damaged twin is reported here, and not by the page.
             catalog.version(twin, None)?;
         }
+        // A damaged twin is said and left out: the others are served.
         let found = catalog.twins()?;
         for DamagedTwin { name, error } in &found.damaged {
             tracing::error!(twin = name, "damaged, not served: {error}");
@@ -311,6 +312,7 @@ impl Serve {
                 tracing::info!("metrics at http://{address}/metrics");
             }
             stop.await;
+            // A second signal ends the wait for running sessions.
             let again = wildcity_server::stop_signal()?;
             tokio::select! {
                 () = running.end_sessions() => {}

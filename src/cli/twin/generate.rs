@@ -88,9 +88,11 @@ impl Generate {
         let city = wildcity_generate::city(&settings)?;
         let drive = wildcity_generate::city_drive(&settings)?;
         let spoil = self.spoil.map(|amount| Spoil::new(amount, settings.seed, &drive));
+        // Mistakes in the options are found before gigabytes are written.
         let spoil = spoil.transpose()?;
         let catalog = self.twins.catalog()?;
         let gaussians = settings.gaussians();
+        // An object store has no free space that could be asked for.
         let is_on_disk = catalog.traffic().is_none();
         if is_on_disk {
             check_free_space(catalog.dir(), gaussians)?;
@@ -101,6 +103,7 @@ impl Generate {
             catalog.begin(&self.twin, CommitKind::Import, StorageOptions::default())?;
         let bar = progress::count("building");
         bar.set_length(gaussians);
+        // Cell by cell: a city of kilometres does not fit into memory.
         for cell in city {
             let spoiled = spoil.as_ref().map(|spoil| spoil.apply(&cell.gaussians));
             commit.put(spoiled.as_ref().unwrap_or(&cell.gaussians), None, &mut |_, _| {})?;

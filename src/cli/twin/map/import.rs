@@ -44,10 +44,14 @@ impl Import {
         let bytes = ingest::read_whole(&self.file, wildcity_convert::TEXT_BYTES as u64);
         let bytes = bytes.with_context(context)?;
         anyhow::ensure!(
+            // Both are XML of ASAM, and easily mixed up: the message names the command for the
+            // other one.
             !is_openscenario(&bytes),
             "{} is OpenSCENARIO: `wildcity scenario import` reads it",
             self.file.display()
         );
+        // By content and not by name: GeoJSON has the extensions .geojson and .json, and XML begins
+        // with `<`.
         let is_json = bytes.trim_ascii_start().first() == Some(&b'{');
         let (map, geo, warnings) = if is_json {
             (geojson::read(&bytes, self.origin).with_context(context)?, None, Vec::new())
