@@ -186,6 +186,7 @@ impl Import {
             _ => SourceAxes::default(),
         };
         let changes = self.profile.load()?;
+        // Applied to the default only to find mistakes before a large file is read.
         changes.apply(RenderProfile::default())?;
         let expected = if self.axes.is_some() { &axes } else { &default_axes };
         let [expected_axes, _] = expected.options();
@@ -225,6 +226,7 @@ impl Import {
                 "note: axes=identity; most captures need --axes y-down-z-forward, and glTF --axes '-1 0 0 0 0 1 0 1 0'"
             )?;
         }
+        // A file may say its own axes, which are known only now: then the sky is turned by those.
         let sky = if used_axes == expected_axes { sky } else { self.sky.read(&used_axes)? };
         if gaussians.is_empty() {
             let source = source.display();

@@ -67,6 +67,7 @@ pub(super) fn read_profile(path: &Path) -> anyhow::Result<ProfileOverrides> {
     let cannot = || format!("--profile {text}");
     let json = ingest::read_whole(path, limits::PROFILE_FILE_BYTES).with_context(cannot)?;
     let changes: ProfileOverrides = serde_json::from_slice(&json).with_context(cannot)?;
+    // Applied to the default only to report a field out of range with the name of the file.
     changes.apply(RenderProfile::default()).with_context(cannot)?;
     Ok(changes)
 }

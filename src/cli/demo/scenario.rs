@@ -38,6 +38,7 @@ impl DemoScenario {
         for actor in actors.into_iter().flatten() {
             let name = actor["asset"].as_str().unwrap_or_default();
             if let Some(asset) = assets.iter().find(|asset| asset.description.name == name) {
+                // By hash, because a catalog may have several assets of one name.
                 actor["asset"] = asset.hash.clone().into();
             }
         }

@@ -106,6 +106,8 @@ pub(in crate::cli) fn candidate(
         BackendName::Cpu => Ok(Box::new(hardware.cpu()?)),
         BackendName::Gpu => match hardware.gpu() {
             Ok(gpu) => Ok(Box::new(gpu)),
+            // A machine without a GPU still tests the other backends: the table names what is
+            // missing.
             Err(error) => Err(("gpu", error.to_string())),
         },
     })

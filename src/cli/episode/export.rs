@@ -91,6 +91,7 @@ impl Export {
         let path = super::find_record(&self.episode, &self.episodes)?;
         let target = self.target()?;
         let is_record = target
+            // A target that does not exist yet has no canonical path, and is not the record.
             .canonicalize()
             .is_ok_and(|target| path.canonicalize().is_ok_and(|record| record == target));
         anyhow::ensure!(

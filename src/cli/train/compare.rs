@@ -53,6 +53,7 @@ Example:
 impl Compare {
     pub(super) fn run(mut self) -> anyhow::Result<()> {
         output::create_dir(&self.out)?;
+        // Sorted and each once, so that the order of the options does not change the table.
         self.size.sort_by(f64::total_cmp);
         self.size.dedup();
         for numbers in [&mut self.steps, &mut self.cap] {
@@ -66,6 +67,7 @@ impl Compare {
         let Inputs { images: opened, settings, .. } =
             self.source.open(self.source.settings()?, largest, largest_cap)?;
         let all = self.combinations(settings.growth.cap);
+        // All runs are judged by the same images, the largest: small ones hide what is blurred.
         let judges = opened.images();
         ensure!(
             !judges.held_out().is_empty(),
@@ -82,6 +84,7 @@ impl Compare {
                 "run {number} of {}: size {size}, {steps} steps, cap {cap}",
                 all.len()
             )?;
+            // Stopped by a signal: what is complete has been written already.
             let Some(trainer) = self.train(backend, size, steps, cap)? else {
                 let done = output::counted(runs.len(), "run");
                 bail!("stopped: {done} of {} complete", all.len());
@@ -97,6 +100,7 @@ impl Compare {
                 held_out_db: judged.mean_db,
             });
             pictures.push(judged.middle);
+            // After each run, so that hours of work are not lost if a later one fails.
             self.write(&Comparison {
                 source: &source,
                 command: &command,
