@@ -15,9 +15,9 @@ use crate::training_image::TrainingImage;
 /// How the files are written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ColmapForm {
-    /// cameras.txt, images.txt, points3D.txt.
+    /// The files cameras.txt, images.txt and points3D.txt.
     Text,
-    /// cameras.bin, images.bin, points3D.bin.
+    /// The files cameras.bin, images.bin and points3D.bin.
     Binary,
 }
 

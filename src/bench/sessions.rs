@@ -194,7 +194,7 @@ struct Driver {
 }
 
 impl Driver {
-    /// 30 m/s.
+    /// Distance of a step, in metres: 30 m/s at ten steps per second.
     const STEP_M: f64 = 3.0;
 
     /// Steps until the given moment. Starts over at the end of the route.

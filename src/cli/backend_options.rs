@@ -240,7 +240,7 @@ impl HardwareOptions {
 }
 
 impl RendererOptions {
-    /// Creates the backend.
+    /// Creates the backend that `--backend` and `--cpu-through` choose.
     pub fn backend(&self) -> anyhow::Result<Box<dyn Backend>> {
         let BackendOptions { backend, hardware } = &self.backend;
         match (self.cpu_through, backend) {
@@ -284,7 +284,7 @@ pub fn gib(text: &str) -> Result<f64, String> {
     }
 }
 
-/// GiB in bytes.
+/// Converts GiB to bytes, rounded down.
 pub fn bytes_of_gib(gib: f64) -> u64 {
     (gib * f64::from(1 << 30)) as u64
 }

@@ -5,16 +5,14 @@ use std::process::ExitCode;
 /// An end of the program with an exit code of its own.
 #[derive(Debug)]
 pub struct Exit {
-    /// The exit code.
     pub code: u8,
-    /// What happened.
     pub message: String,
     /// Whether this is a result and not an error: a result is printed without `error:`.
     pub is_finding: bool,
 }
 
 impl Exit {
-    /// The program failed.
+    /// The program failed: the message is printed after `error:`.
     pub fn error(code: u8, message: String) -> Self {
         Self { code, message, is_finding: false }
     }

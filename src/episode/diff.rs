@@ -25,7 +25,7 @@ pub enum What {
 pub struct Difference {
     pub step: u64,
     pub what: What,
-    /// How, in words.
+    /// The difference as a part of a sentence.
     pub how: String,
 }
 

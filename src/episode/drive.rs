@@ -120,7 +120,7 @@ pub(crate) fn ego_samples(poses: &[Pose], step_s: f64) -> Vec<EgoSample> {
         .collect()
 }
 
-/// Differences per second.
+/// Central differences per second, one-sided at both ends.
 fn slopes<T>(values: &[T], step_s: f64) -> Vec<T>
 where
     T: Copy + std::ops::Sub<Output = T> + std::ops::Div<f64, Output = T>,

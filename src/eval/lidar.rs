@@ -82,7 +82,7 @@ pub enum LidarError {
 pub struct WorldPoints {
     /// Positions in metres, in order of time.
     pub points_m: Vec<DVec3>,
-    /// Times in microseconds.
+    /// Times in microseconds, not decreasing.
     pub time_us: Vec<i64>,
     /// Points that were left out, because no two poses at most 0.2 s apart enclose their time.
     pub skipped: usize,
@@ -130,7 +130,7 @@ pub struct LidarBin {
     pub mean_m: f64,
 }
 
-/// Means over images.
+/// Means over the images that LiDAR points were compared with.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct LidarMeans {
     /// Number of images with points.
@@ -192,7 +192,7 @@ impl LidarPoints {
         Self { points_m, time_us, rig_from_lidar: Pose::IDENTITY, poses: Some(poses) }
     }
 
-    /// Number of points.
+    /// Number of points, of all times.
     pub fn len(&self) -> usize {
         self.points_m.len()
     }

@@ -24,7 +24,6 @@ pub struct Rows<R> {
 }
 
 impl<R: Row> Rows<R> {
-    /// Opens a table.
     pub(crate) fn open(path: &Path) -> Result<Self, LogError> {
         let file = File::open(path).map_err(|error| LogError::file(path, &error))?;
         Ok(Self {

@@ -22,7 +22,7 @@ pub const LEAST_PROGRESS: f64 = 0.8;
 /// Progress is not measured along a recording that moves less than this, in metres.
 const LEAST_WAY_M: f64 = 2.0;
 
-/// The result.
+/// The verdict on an episode as a whole.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Judgement {
@@ -67,7 +67,6 @@ pub enum Criterion {
 }
 
 impl Criterion {
-    /// All criteria.
     pub const ALL: [Self; 4] = [Self::Contact, Self::Static, Self::OffRoad, Self::Progress];
 
     /// The name in results: that of its fault, or the beginning of their names.
@@ -138,7 +137,7 @@ impl Fault {
     }
 }
 
-/// Judges an episode.
+/// Judges an episode by WildCity's own criteria.
 pub fn verdict(record: &DriveRecord) -> Verdict {
     let mut not_judged = Vec::new();
     // Criteria without their input are collected, not returned early: a fault of another one still

@@ -38,7 +38,7 @@ impl Polyline {
         Some(Self { points_m, stations_m })
     }
 
-    /// Its points.
+    /// Its corners in order, in metres.
     pub fn points_m(&self) -> &[DVec2] {
         &self.points_m
     }

@@ -13,7 +13,6 @@ use wildcity_sim::Dynamics;
 use crate::case::Case;
 use crate::technical::Technical;
 
-/// A driven episode.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Finished {
     /// Its file's name without the directory.

@@ -15,7 +15,7 @@ pub const EPISODES: usize = 100_000;
 /// Steps of an episode whose scenario gives no time: 10 minutes at 10 Hz.
 pub const STEPS: u64 = 6_000;
 
-/// Episodes at once.
+/// Most episodes that are driven at once.
 pub const JOBS: usize = 64;
 
 /// How long an external agent may take for an episode, unless the command line says otherwise.

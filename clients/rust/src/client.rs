@@ -116,7 +116,7 @@ pub struct StepOptions {
 /// How an episode starts.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ResetOptions {
-    /// Its seed.
+    /// Seed of the episode's random draws.
     pub seed: u64,
     /// Where it starts; the session's start if `None`.
     pub start: Option<Start>,
@@ -133,7 +133,7 @@ pub struct Welcome {
     pub protocol: String,
     /// Name and version of the server.
     pub server: ServerInfo,
-    /// The server's limits.
+    /// Largest sizes, counts and times that the server accepts.
     pub limits: Limits,
     /// Name of the render backend.
     pub backend: String,

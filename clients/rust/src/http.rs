@@ -49,7 +49,7 @@ pub enum HttpError {
     /// The text is not the address of a server.
     #[error("{url:?} is not a server: expected http://HOST:PORT or https://HOST:PORT")]
     Url {
-        /// The text.
+        /// The text as it was given.
         url: String,
     },
     /// The token cannot be sent.
@@ -58,21 +58,21 @@ pub enum HttpError {
     /// TLS cannot be set up.
     #[error("cannot set up TLS: {reason}")]
     Tls {
-        /// The cause.
+        /// What is wrong with the root certificates, or missing.
         reason: String,
     },
     /// The server did not answer, or its answer was cut off.
     #[error("no answer from {server}: {reason}")]
     NoAnswer {
-        /// The server.
+        /// Host and port of the server.
         server: String,
-        /// The cause.
+        /// What the network reported.
         reason: String,
     },
     /// The server refused the request.
     #[error("refused, {status}: {message}")]
     Refused {
-        /// HTTP status.
+        /// Status of the answer, such as 409.
         status: u16,
         /// Code of the error; `None` if the answer is not of this protocol.
         code: Option<Code>,
@@ -87,15 +87,15 @@ pub enum HttpError {
     /// The answer does not conform to the protocol.
     #[error("cannot read the answer of {server}: {reason}")]
     Answer {
-        /// The server.
+        /// Host and port of the server.
         server: String,
-        /// The cause.
+        /// What is wrong with the answer.
         reason: String,
     },
     /// A file cannot be read.
     #[error("cannot read {path}: {cause}")]
     File {
-        /// The file.
+        /// Path of the file, as it was given.
         path: String,
         /// The error of the operating system.
         cause: std::io::Error,
@@ -302,7 +302,7 @@ impl HttpClient {
         HttpError::Answer { server: self.authority(), reason: reason.to_string() }
     }
 
-    /// `host:port`, for messages.
+    /// Host and port of the server, for messages.
     fn authority(&self) -> String {
         self.server.authority().to_owned()
     }

@@ -66,7 +66,7 @@ inbound!(NewActor, "new_actor");
 pub struct Refused {
     /// The message's `seq`, if it has exactly one and it is a number.
     pub seq: Option<u64>,
-    /// The mistake.
+    /// The first mistake of the message, in the order of its text.
     pub mistake: Mistake,
 }
 

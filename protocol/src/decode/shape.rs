@@ -16,13 +16,12 @@ pub struct Shapes {
     pub(super) definitions: BTreeMap<String, Shape>,
 }
 
-/// Allowed values.
 #[derive(Debug)]
 pub(super) enum Shape {
-    /// Anything but `null`.
+    /// A value of any type except `null`.
     Any,
     Boolean,
-    /// A finite number.
+    /// A finite number, whole or not.
     Number,
     /// A whole number that fits a type.
     Integer(RangeInclusive<i128>),

@@ -37,7 +37,7 @@ const HISTORY_US: i64 = 100_000;
 /// How an episode is driven.
 #[derive(Clone, Debug)]
 pub struct EpisodeSettings {
-    /// `ws://HOST:PORT/v1/session`.
+    /// URL of the server's WebSocket, `ws://HOST:PORT/v1/session`.
     pub server: String,
     /// Token for the server.
     pub token: Option<String>,
@@ -217,7 +217,7 @@ async fn recorded_drive(
     Ok(drive)
 }
 
-/// `http://HOST:PORT` of `ws://HOST:PORT/v1/session`.
+/// `http://HOST:PORT` of the server whose WebSocket is `ws://HOST:PORT/v1/session`.
 fn http_address(server: &str) -> String {
     let address = server.trim_end_matches("/v1/session");
     // The `s` of `wss` stays, so that it becomes `https`.

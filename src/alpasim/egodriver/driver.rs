@@ -85,7 +85,6 @@ impl Driver {
         self.uuid.clone()
     }
 
-    /// Begins a session.
     pub(super) async fn start_session(
         &mut self,
         request: wire::DriveSessionRequest,
@@ -93,13 +92,11 @@ impl Driver {
         self.call::<_, wire::SessionRequestStatus>("start_session", request).await.map(drop)
     }
 
-    /// Ends the session.
     pub(super) async fn close_session(&mut self) -> Result<(), DriverError> {
         let request = wire::DriveSessionCloseRequest { session_uuid: self.uuid() };
         self.call::<_, common::Empty>("close_session", request).await.map(drop)
     }
 
-    /// Sends an image.
     pub(super) async fn submit_image(
         &mut self,
         image: wire::CameraImage,

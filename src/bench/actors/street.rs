@@ -33,7 +33,6 @@ const HALF: [f64; 2] = [0.5, 0.25 / 0.66];
 
 /// The cars, and the drive between them.
 pub(super) struct Cars {
-    /// The vehicle's cameras.
     pub(super) rig: Rig,
     drive: Trajectory,
     asset: String,

@@ -19,7 +19,6 @@ pub(super) struct Driven {
     pub(super) rounds: u64,
 }
 
-/// One session's agent.
 pub(super) struct Agent {
     pub(super) url: String,
     pub(super) twin: String,

@@ -14,7 +14,6 @@ pub(super) enum DemoScenario {
 }
 
 impl DemoScenario {
-    /// Its file.
     fn text(self) -> &'static str {
         match self {
             Self::CutIn => include_str!("../../../scenes/cut-in.json"),

@@ -31,7 +31,6 @@ const NOT_KEYS: [&str; 5] = ["config", "help", "open", "print_config", "twin"];
 /// The options of one run.
 #[derive(Debug)]
 pub(super) struct Resolved {
-    /// The options.
     pub(super) serve: Serve,
     matches: ArgMatches,
 }

@@ -22,7 +22,6 @@ pub(super) struct Elements {
     marks: Vec<(String, Draft)>,
 }
 
-/// An event.
 #[derive(Debug, Default)]
 pub(super) struct Event {
     /// `ACTOR/TRIGGER` of its actions, with the names of the actions.

@@ -47,7 +47,7 @@ impl Part {
         (Self::Custom, "custom"),
     ];
 
-    /// Its name.
+    /// The name of the part, as messages have it.
     pub fn name(self) -> &'static str {
         Self::ALL.iter().find(|(part, _)| *part == self).map_or("", |(_, name)| name)
     }

@@ -21,7 +21,6 @@ const GRID: u32 = 33;
 // 40 for each of the five unknowns: the sums of the fit are then close to integrals over the angle.
 const FITTED_ANGLES: u32 = 200;
 
-/// A calibration.
 pub(super) struct Calibration {
     pub(super) message: foxglove::CameraCalibration,
     /// How far it is off the lens at most, in pixels, within the field of the lens.
@@ -41,7 +40,7 @@ enum Model {
     Pinhole,
     /// k1 to k6, p1 and p2.
     Rational([f64; 6], [f64; 2]),
-    /// k1 to k4.
+    /// Coefficients k1 to k4 of `cv::fisheye`.
     Fisheye([f64; 4]),
 }
 

@@ -65,7 +65,6 @@ struct Listed {
     images: Vec<ListedImage>,
     /// The folder that names are in, unless the user gives a different one.
     folder: PathBuf,
-    /// As [`ImageList::is_in_scene_axes`].
     is_in_scene_axes: bool,
     warnings: Vec<String>,
 }

@@ -32,7 +32,6 @@ pub(super) struct Labels {
 }
 
 impl Labels {
-    /// Reads the files.
     pub(super) fn load(
         settings: &Settings,
         source: &OpenScene,

@@ -23,7 +23,6 @@ pub(super) struct FeatureSet {
 }
 
 impl Networks {
-    /// Loads the networks.
     pub(super) fn load(settings: &Settings) -> anyhow::Result<Self> {
         let load = |option: &str, path: &Path, compares: bool| {
             let about = || format!("{option} {}", path.display());

@@ -28,7 +28,6 @@ pub(super) struct Repairer {
     cache: ReferenceCache,
 }
 
-/// A repaired image.
 pub(super) struct Repaired {
     pub(super) rgb8: Vec<u8>,
     /// Name of the nearest recorded image, if the model saw it.

@@ -37,7 +37,7 @@ enum Lens {
     Table(Table),
 }
 
-/// Pixels of directions.
+/// Pixels of directions on a grid, for lenses other than the pinhole.
 #[derive(Debug)]
 struct Table {
     /// Cells per unit of the stereographic plane, which has `CELLS` / 2 cells in each direction.

@@ -147,7 +147,7 @@ struct RepairMeasurement<'a> {
 
 /// The images of a camera in one frame.
 struct KindImages {
-    /// Pixels, by kind.
+    /// Red, green and blue of 8 bits, by kind.
     rgb8: Vec<Vec<u8>>,
     /// Times of the repair, by kind.
     repair_ms: Vec<RepairMs>,

@@ -88,7 +88,6 @@ pub struct Submetrics {
 }
 
 impl Submetrics {
-    /// All ones.
     pub const PERFECT: Self = Self {
         nc: 1.0,
         dac: 1.0,

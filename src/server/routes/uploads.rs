@@ -53,7 +53,7 @@ pub(super) async fn show(
     Ok(answer(StatusCode::OK, &*state.spool()?.get(&grant.name, &id)?))
 }
 
-/// `DELETE /v1/uploads/{id}`.
+/// The handler of `DELETE /v1/uploads/{id}`.
 pub(super) async fn delete(
     State(state): State<Arc<ServerState>>,
     Extension(grant): Extension<Arc<Grant>>,

@@ -27,7 +27,7 @@ pub struct Rule {
     pub worse_by: BTreeMap<String, f64>,
 }
 
-/// One tolerance, `NAME=AMOUNT`.
+/// A tolerance of one score, written `NAME=AMOUNT`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Tolerance {
     /// [`PASS_RATE`], or the name of a score, with or without its version.

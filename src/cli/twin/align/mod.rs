@@ -120,7 +120,6 @@ impl FromStr for Up {
     }
 }
 
-/// A point.
 #[derive(Clone, Copy, Debug)]
 struct Point(DVec3);
 

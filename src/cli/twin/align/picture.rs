@@ -16,7 +16,6 @@ use crate::cli::caption;
 
 /// Size of one of the four pictures, in pixels.
 const SIZE_PX: [u32; 2] = [720, 440];
-/// Pixels between them.
 const GAP_PX: u32 = 6;
 /// Share of Gaussians on each side of each axis that are left out: the sky and floaters.
 const LEFT_OUT: f64 = 0.02;

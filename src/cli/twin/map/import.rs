@@ -100,7 +100,7 @@ fn anchor_text(geo: &GeoAnchor) -> String {
     }
 }
 
-/// EAST,NORTH.
+/// Parses the option `--origin`, as `EAST,NORTH`.
 pub(in crate::cli) fn origin(text: &str) -> Result<[f64; 2], String> {
     let expected = || {
         "expected two numbers, for example 691000,5334000 in metres or 11.58,48.14 in degrees"
