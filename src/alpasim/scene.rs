@@ -149,7 +149,7 @@ impl LocalFrame {
     ) -> Result<Pose, SceneError> {
         let pose = pose.ok_or(SceneError::Missing { field })?;
         // A pose without a quaternion is not taken for the identity: the field was forgotten.
-        let (Some(vec), Some(quat)) = (pose.vec, pose.quat) else {
+        let Some((vec, quat)) = pose.vec.zip(pose.quat) else {
             return Err(SceneError::Missing { field });
         };
         // To f64 before the origin is added, in which 100 km have 1e-11 m.

@@ -255,7 +255,8 @@ fn pose_at(poses: &[Keyframe], time_us: i64) -> Option<Pose> {
         return None;
     }
     let share = (time_us - before.time_us) as f64 / gap_us as f64;
-    let [a, b] = [before.world_from_rig, next.world_from_rig];
+    let a = before.world_from_rig;
+    let b = next.world_from_rig;
     let rotation = slerp(a.rotation, b.rotation, share);
     Some(Pose { position_m: a.position_m.lerp(b.position_m, share), rotation })
 }
@@ -263,7 +264,8 @@ fn pose_at(poses: &[Keyframe], time_us: i64) -> Option<Pose> {
 /// The rotation at a share of the shorter arc between two, by the angle itself also where it is
 /// small (Shoemake 1985).
 fn slerp(a: DQuat, b: DQuat, share: f64) -> DQuat {
-    let [a, mut b] = [DVec4::from(a), DVec4::from(b)];
+    let a = DVec4::from(a);
+    let mut b = DVec4::from(b);
     // q and -q are one rotation: the nearer of both gives the shorter arc.
     if a.dot(b) < 0.0 {
         b = -b;
@@ -303,7 +305,8 @@ impl LidarDepth {
             }
         }
         let bin = |at: usize| {
-            let [from_m, to_m] = [BINS_M[at], BINS_M[at + 1]];
+            let from_m = BINS_M[at];
+            let to_m = BINS_M[at + 1];
             // Bins are half-open: a point counts in one of them.
             let within = errors.iter().filter(|(depth_m, _)| (from_m..to_m).contains(depth_m));
             let points = within.clone().count();
@@ -333,7 +336,8 @@ impl LidarMeans {
             let with_points = of.iter().filter(|bin| bin.points > 0);
             // Weighted by points, because bins are of the points of all images together.
             let sum_m: f64 = with_points.map(|bin| bin.points as f64 * bin.mean_m).sum();
-            let [from_m, to_m] = [BINS_M[at], BINS_M[at + 1]];
+            let from_m = BINS_M[at];
+            let to_m = BINS_M[at + 1];
             LidarBin { from_m, to_m, points, mean_m: sum_m / points as f64 }
         };
         Some(Self {

@@ -98,7 +98,8 @@ impl<'a> Input<'a> {
     fn deviation(&self) -> Measured {
         // `future` leaves out the ego's own pose at the decision, which is no part of the plan.
         let of_pair = |pair: &[&Plan]| {
-            let [before, plan] = [pair[0], pair[1]];
+            let before = pair[0];
+            let plan = pair[1];
             // Only times that both plans have: beyond its end the earlier one is not extrapolated.
             let common = plan.future().iter().filter(|pose| pose.time_us <= before.end_us());
             let distances_m = common.filter_map(|pose| {

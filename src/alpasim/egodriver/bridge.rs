@@ -270,7 +270,8 @@ fn recorded_speed_m_s(drive: &Drive, settings: &EpisodeSettings) -> f64 {
     let after = drive.poses.iter().position(is_after).unwrap_or(0);
     // The pose before it must exist: a start at the first pose takes the first segment.
     let after = after.clamp(1, drive.poses.len() - 1);
-    let [from, to] = [&drive.poses[after - 1], &drive.poses[after]];
+    let from = &drive.poses[after - 1];
+    let to = &drive.poses[after];
     (to.station_m - from.station_m) / (1e-6 * (to.time_us - from.time_us) as f64)
 }
 

@@ -31,7 +31,8 @@ pub(super) struct Sensorsim {
 
 impl Sensorsim {
     pub(super) fn new(engine: Arc<Engine>, stopping: watch::Receiver<bool>) -> Self {
-        let (open, assets) = (OpenVersions::default(), Arc::default());
+        let open = OpenVersions::default();
+        let assets = Arc::default();
         let physics = Arc::new(Semaphore::new(limits::PHYSICS_REQUESTS));
         Self { engine, open, assets, physics, stopping }
     }

@@ -75,7 +75,8 @@ impl ObjectAssets {
             return Ok(Vec::new());
         }
         let shapes: Vec<ObjectShape> = objects.iter().map(|object| object.shape.clone()).collect();
-        let (own, engine) = (self.clone(), engine.clone());
+        let own = self.clone();
+        let engine = engine.clone();
         // Assets may be read from disk or made, neither of which an async thread must do.
         let read = tokio::task::spawn_blocking(move || own.assets(&engine, &shapes));
         let assets = read.await.map_err(|_| SessionError::Crashed)??;

@@ -175,7 +175,8 @@ pub(in crate::cli) fn swept(file: &TracksFile) -> anyhow::Result<Vec<(CutPlace, 
         let track = section.shifted(0)?;
         let place = |world_from_box: Pose| (CutPlace { world_from_box, box_ }, section.class);
         for pair in track.keyframes().windows(2) {
-            let [from, to] = [pair[0].world_from_actor, pair[1].world_from_actor];
+            let from = pair[0].world_from_actor;
+            let to = pair[1].world_from_actor;
             // The corners also move as the box turns.
             let turned_m = 0.5 * length_m.hypot(width_m) * from.rotation.angle_between(to.rotation);
             let moved_m = from.position_m.distance(to.position_m) + turned_m;

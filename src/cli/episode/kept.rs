@@ -26,7 +26,8 @@ pub(super) fn keep_cameras(frame: &mut FrameRecord, kept_cameras: &[usize], rig_
     for pose in 0..frame.poses.len() {
         let mut of_pose = Vec::new();
         for rendered in frame.due_cameras(pose, rig_cameras) {
-            let (image, repair) = (images.next(), repairs.next());
+            let image = images.next();
+            let repair = repairs.next();
             if kept_cameras.contains(&rendered) && is_driven {
                 of_pose.push(rendered);
                 frame.images.extend(image);

@@ -176,7 +176,8 @@ impl Run {
             progress: Box::new(move |episode: &EpisodeEntry| {
                 counted.inc(1);
                 let status = episode.status.name();
-                let (done, all) = (counted.position(), counted.length().unwrap_or(0));
+                let done = counted.position();
+                let all = counted.length().unwrap_or(0);
                 let seconds = begun.elapsed().as_secs_f64();
                 counted.suspend(|| {
                     eprintln!("{done}/{all} after {seconds:.0} s: {status} {}", episode.name);

@@ -67,7 +67,8 @@ fn looks(scenario: &Scenario, assets: &StoredAssets<'_>) -> Vec<String> {
             format!("{:.1} x {:.1} x {:.1} m", box_.length_m, box_.width_m, box_.height_m)
         };
         is_other.then(|| {
-            let (drawn, real) = (size(&own), size(box_));
+            let drawn = size(&own);
+            let real = size(box_);
             format!("actor {name:?} looks as if it had {drawn}, and has {real}: set its asset")
         })
     };

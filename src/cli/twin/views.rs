@@ -250,7 +250,8 @@ impl Views {
         let background = manifest.profile.background;
         // What is transparent gets the background that the renderer draws there as well.
         let (mut rgb8, mut camera) = picture::real(&image.file, &image.camera, background)?;
-        let [width, height] = [camera.width_px, camera.height_px];
+        let width = camera.width_px;
+        let height = camera.height_px;
         let mask = image.mask.as_deref();
         let mask = mask.map(|file| picture::mask(file, [width, height])).transpose()?;
         let outside = own_vehicle::outside(manifest.rig.as_ref(), camera_name, [width, height]);
@@ -270,7 +271,8 @@ impl Views {
             rgb8 = imageops::resize(&large, small[0], small[1], FilterType::Lanczos3).into_raw();
             counts = counts.map(|counts| reduced_mask(&counts, [width, height], small));
         }
-        let [width, height] = [camera.width_px, camera.height_px];
+        let width = camera.width_px;
+        let height = camera.height_px;
         let file = wildcity_session::jpeg(&rgb8, width, height, self.quality);
         let stored = commit.put_image(&file.map_err(anyhow::Error::msg)?)?;
         // A mask in which every pixel counts says nothing, and is not stored.

@@ -249,7 +249,7 @@ fn lane_change(
             // The lane is that after the changes that were read so far. The direction is that of
             // the start.
             let spot = entity.place.and_then(|place| place.spot);
-            let (Some(lane), Some(spot)) = (entity.lane, spot) else {
+            let Some((lane, spot)) = entity.lane.zip(spot) else {
                 return Err(target.wrong(&format!("{of:?} is on no lane")));
             };
             if of == context.ego && context.is_in_story {

@@ -163,7 +163,8 @@ fn parameter_condition(
     let Some(value) = value else {
         return Err(kind.wrong(&format!("there is no parameter or variable {name:?}; declare it")));
     };
-    let [rule, bound] = [kind.text("rule")?, kind.text("value")?];
+    let rule = kind.text("rule")?;
+    let bound = kind.text("value")?;
     let holds = super::catalogs::compare(&rule, value, &bound);
     let sets: Vec<_> = context.sets.iter().filter(|(other, ..)| *other == name).collect();
     if !sets.is_empty() {

@@ -164,7 +164,8 @@ impl Ledger {
         for (index, attribute) in node.attributes().enumerate() {
             let is_read = self.attributes.borrow().contains(&(file.0, node.id(), index));
             if !is_read && !is_harmless(name, attribute.name()) {
-                let [key, value] = [attribute.name(), attribute.value()];
+                let key = attribute.name();
+                let value = attribute.value();
                 let message = format!("{key}={value:?} is not read here; remove the attribute");
                 return Err(ConvertError { message, ..place() });
             }

@@ -17,7 +17,8 @@ pub(super) fn place_from(
             kind.only(&[])?;
             note_tilt(&kind)?;
             let [dx_m, dy_m] = context.shift_m;
-            let [x_m, y_m] = [kind.number("x")? + dx_m, kind.number("y")? + dy_m];
+            let x_m = kind.number("x")? + dx_m;
+            let y_m = kind.number("y")? + dy_m;
             let xyz_m = [x_m, y_m, kind.number_or_0("z")?];
             on_roads(xyz_m, kind.number_or_0("h")?, context)
         }
@@ -82,8 +83,9 @@ fn base_place(kind: &Element<'_>, context: &Context<'_>) -> Result<(String, Plac
 
 fn relative_place(kind: &Element<'_>, context: &Context<'_>) -> Result<Place, ConvertError> {
     let (_, base) = base_place(kind, context)?;
-    let [dx, dy, dz] = ["dx", "dy", "dz"].map(|axis| kind.number_or_0(axis));
-    let (dx, dy, dz) = (dx?, dy?, dz?);
+    let dx = kind.number_or_0("dx")?;
+    let dy = kind.number_or_0("dy")?;
+    let dz = kind.number_or_0("dz")?;
     let mut xyz_m = match kind.name() {
         "RelativeObjectPosition" => base.shifted(dx, dy).xyz_m,
         // Along the world's axes, whatever the heading of the entity.
@@ -95,7 +97,8 @@ fn relative_place(kind: &Element<'_>, context: &Context<'_>) -> Result<Place, Co
 
 fn lane_place(kind: &Element<'_>, context: &Context<'_>) -> Result<Place, ConvertError> {
     let roads = roads(kind, context)?;
-    let [s, offset] = [kind.number("s")?, kind.number_or_0("offset")?];
+    let s = kind.number("s")?;
+    let offset = kind.number_or_0("offset")?;
     let lane = kind.whole("laneId")?;
     let at = roads.place(&kind.text("roadId")?, lane, s, offset);
     let at = at.map_err(|message| kind.wrong(&message))?;

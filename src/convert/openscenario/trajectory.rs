@@ -129,7 +129,8 @@ fn nurbs(shape: &Element<'_>, context: &Context<'_>) -> Result<Line, ConvertErro
         return Err(shape.wrong(message));
     }
     // Where all of `order` basis functions overlap, which is the domain of the curve.
-    let [from, to] = [knots[order - 1], knots[controls.len()]];
+    let from = knots[order - 1];
+    let to = knots[controls.len()];
     // The polygon of the control points is no shorter than the curve.
     let polygon_m: f64 = controls
         .windows(2)

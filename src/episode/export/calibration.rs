@@ -52,7 +52,8 @@ impl Calibration {
         let DVec2 { x: fx, y: fy } = nearest.focal_px;
         // Foxglove and OpenCV count pixels from the middle of the first one, this project from its
         // corner.
-        let [cx, cy] = [camera.pinhole.cx - 0.5, camera.pinhole.cy - 0.5];
+        let cx = camera.pinhole.cx - 0.5;
+        let cy = camera.pinhole.cy - 0.5;
         let message = foxglove::CameraCalibration {
             timestamp: Some(timestamp(time_us)),
             width: camera.width_px,
@@ -100,7 +101,8 @@ impl Nearest {
         // With s = θ / θmax and p = (s³, s⁵, s⁷, s⁹), the sum of (r - a s - b·p)² is least where
         // Σs² a + m·b = Σ s r and m a + N b = Σ r p, with m = Σ s p and N = Σ p pᵀ.
         // The normal equations of the linear coefficient, and of the four others.
-        let [mut linear, mut linear_right] = [0.0, 0.0];
+        let mut linear = 0.0;
+        let mut linear_right = 0.0;
         let [mut mixed, mut right] = [DVec4::ZERO; 2];
         let mut normal = DMat4::ZERO;
         for k in 1..=FITTED_ANGLES {

@@ -216,9 +216,8 @@ impl<'a> Evaluator<'a> {
         image: &RealImage,
         is_shown: bool,
     ) -> anyhow::Result<Vec<OffTrajectoryImage>> {
-        let (Some(drives), Some(lens)) = (&self.drives, &compared.lens) else {
-            return Ok(Vec::new());
-        };
+        let Some(drives) = &self.drives else { return Ok(Vec::new()) };
+        let Some(lens) = &compared.lens else { return Ok(Vec::new()) };
         let tools = Tools { renderer: &self.renderer, repairer: self.repairer.as_ref(), drives };
         let on_drive = OnDrive {
             name: &image.name,

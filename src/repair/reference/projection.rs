@@ -139,8 +139,10 @@ impl Table {
             if !is_within || !is_wanted {
                 continue;
             }
-            let [left, top] = [column as usize, row as usize];
-            let [x, y] = [column - left as f32, row - top as f32];
+            let left = column as usize;
+            let top = row as usize;
+            let x = column - left as f32;
+            let y = row - top as f32;
             // A row has one node more than it has cells; `last` is excluded above, so that
             // node + 1 exists.
             let first = top * (CELLS + 1) + left;

@@ -249,7 +249,8 @@ impl<'a> RepairMeasurement<'a> {
                 let view = &station.views[frame][camera];
                 image.trust = self.coverage.trust(pose, view, &image.opacity).value;
             }
-            let [now, before] = [&now[camera], &before[camera]];
+            let now = &now[camera];
+            let before = &before[camera];
             // This frame first: references that it reads are in memory for the earlier one.
             let images = self.repair_all_kinds(station, 0, camera, now)?;
             let images_before = self.repair_all_kinds(station, 1, camera, before)?;

@@ -176,7 +176,8 @@ fn view(extent: &Extent, is_side: bool) -> View {
 
 /// Draws a line of the ground over the picture, half transparent.
 fn line(picture: &mut RgbImage, view: &View, from: DVec3, to: DVec3) {
-    let (Some(from), Some(to)) = (view.project_world(from), view.project_world(to)) else { return };
+    let ends_px = view.project_world(from).zip(view.project_world(to));
+    let Some((from, to)) = ends_px else { return };
     // One step a pixel; the bound is for lines of which an end projects far outside.
     let steps = (to - from).abs().max_element().ceil().clamp(1.0, 4_000.0);
     for step in 0..=steps as u32 {

@@ -159,7 +159,8 @@ impl Tables {
             let pinhole = &camera.camera.pinhole;
             // nuScenes counts pixels from the middle of the first one, this project from its
             // corner.
-            let [cx, cy] = [pinhole.cx - 0.5, pinhole.cy - 0.5];
+            let cx = pinhole.cx - 0.5;
+            let cy = pinhole.cy - 0.5;
             let mount = &camera.rig_from_camera;
             let row = json!({
                 "token": self.token("calibrated_sensor", index),
