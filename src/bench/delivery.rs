@@ -123,8 +123,8 @@ impl Delivery {
 
     async fn ways(&self, running: &Running, start: Pose) -> anyhow::Result<Ways> {
         let engine = running.engine().clone();
-        let rig = Rig::preset(&self.rig);
-        let rig = rig.with_context(|| format!("there is no rig {:?}", self.rig))?;
+        let rig =
+            Rig::preset(&self.rig).with_context(|| format!("there is no rig {:?}", self.rig))?;
         let options = Open {
             rig: Some(RigChoice::Full(rig.clone().into())),
             ..self.twin.session(Outputs::colour(Encoding::Raw))
@@ -195,8 +195,8 @@ fn print(out: &mut impl Write, costs: &[[Cost; 4]]) -> io::Result<()> {
         let wall_ms = median_ms(&|cost| cost.wall);
         let processor_ms = median_ms(&|cost| cost.processor);
         // Within a round, so that a clock that rises during the measurement does not matter.
-        let ratio = |round: &[Cost; 4]| round[way].processor.div_duration_f64(round[0].processor);
-        let ratio = median(costs.iter().map(ratio));
+        let share = |round: &[Cost; 4]| round[way].processor.div_duration_f64(round[0].processor);
+        let ratio = median(costs.iter().map(share));
         writeln!(out, "{name:<15} {wall_ms:>10.1} {processor_ms:>14.1} {ratio:>18.3}")?;
     }
     Ok(())

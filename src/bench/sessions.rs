@@ -111,9 +111,10 @@ impl Sessions {
         manifest: &Manifest,
         count: u32,
     ) -> anyhow::Result<Row> {
-        let trajectory = manifest.trajectories.first();
-        let trajectory =
-            trajectory.with_context(|| format!("twin {:?} has no trajectory", manifest.twin))?;
+        let trajectory = manifest
+            .trajectories
+            .first()
+            .with_context(|| format!("twin {:?} has no trajectory", manifest.twin))?;
         let route = Route::new(trajectory)?;
         // Poses along the route, one per step.
         let count_of_poses = (route.length_m() / Driver::STEP_M) as usize + 1;

@@ -140,8 +140,8 @@ impl Import {
                 ),
             }
         };
-        let scale = one("scale=", "1")?;
-        let scale = scale.parse().with_context(|| format!("scale={scale}"))?;
+        let text = one("scale=", "1")?;
+        let scale = text.parse().with_context(|| format!("scale={text}"))?;
         Ok(Self { axes: one("axes=", "identity")?, scale })
     }
 }
@@ -169,11 +169,13 @@ mod tests {
 
     #[test]
     fn mirrors_and_different_files_are_refused() {
-        let mirrored = Import::from_provenance(&provenance(&["axes=y-up-z-forward"])).unwrap();
-        let mirrored = mirrored.placed(None).unwrap_err();
+        let mirrored = Import::from_provenance(&provenance(&["axes=y-up-z-forward"]))
+            .unwrap()
+            .placed(None)
+            .unwrap_err();
         assert!(mirrored.to_string().contains("mirror"), "{mirrored}");
-        let several = ["axes=identity", "scale=1", "axes=y-down-z-forward", "scale=1"];
-        let several = Import::from_provenance(&provenance(&several)).unwrap_err();
+        let options = ["axes=identity", "scale=1", "axes=y-down-z-forward", "scale=1"];
+        let several = Import::from_provenance(&provenance(&options)).unwrap_err();
         assert!(several.to_string().contains("--axes and --scale"), "{several}");
     }
 }

@@ -38,8 +38,7 @@ pub(super) struct LoadedProfile {
 impl ProfileOptions {
     /// Reads the file, if there is one.
     pub(super) fn load(&self) -> anyhow::Result<LoadedProfile> {
-        let from_file = self.profile.as_deref().map(read_profile).transpose()?;
-        let from_file = from_file.unwrap_or_default();
+        let from_file = self.profile.as_deref().map(read_profile).transpose()?.unwrap_or_default();
         Ok(LoadedProfile { from_file, settings: self.settings.clone() })
     }
 }

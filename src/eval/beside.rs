@@ -105,8 +105,11 @@ impl Beside<'_> {
             let drawn = drawn(url, truth, None, &wire_poses).await?;
             for ((station_m, world_from_rig), images) in some_m.iter().zip(&poses).zip(drawn) {
                 for (name, image) in CAMERAS.iter().zip(images) {
-                    let mounted = rig.cameras.iter().find(|camera| camera.name == *name);
-                    let mounted = mounted.context("the demo rig has the camera")?;
+                    let mounted = rig
+                        .cameras
+                        .iter()
+                        .find(|camera| camera.name == *name)
+                        .context("the demo rig has the camera")?;
                     let [width, height] = SIZE_PX;
                     let mut camera = mounted.camera.scaled(width.into(), height.into())?;
                     // The recorded image is drawn at this size: nothing has shrunk it.

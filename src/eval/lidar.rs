@@ -157,8 +157,8 @@ impl LidarPoints {
     pub fn parse(bytes: &[u8]) -> Result<Self, LidarError> {
         let file = SafeTensors::deserialize(bytes)
             .map_err(|error: SafeTensorError| LidarError::File(error.to_string()))?;
-        let points = floats(&file, "points_m", &[None, Some(3)])?;
-        let points = points.ok_or(LidarError::Missing("points_m"))?;
+        let points =
+            floats(&file, "points_m", &[None, Some(3)])?.ok_or(LidarError::Missing("points_m"))?;
         let times = times(&file, "time_us")?.ok_or(LidarError::Missing("time_us"))?;
         if times.len() != points.len() / 3 {
             return Err(LidarError::Tensor {
@@ -221,8 +221,11 @@ impl LidarPoints {
         };
         let own = self.poses.as_ref().map(aligned);
         // The poses of the file come first: they are in the clock of its points.
-        let poses = own.as_deref().or(drive).filter(|poses| !poses.is_empty());
-        let poses = poses.ok_or(LidarError::NoPoses)?;
+        let poses = own
+            .as_deref()
+            .or(drive)
+            .filter(|poses| !poses.is_empty())
+            .ok_or(LidarError::NoPoses)?;
         let mut world = WorldPoints { points_m: Vec::new(), time_us: Vec::new(), skipped: 0 };
         for (time_us, point_m) in self.time_us.iter().zip(&self.points_m) {
             match pose_at(poses, *time_us) {
@@ -412,8 +415,8 @@ fn poses(file: &SafeTensors<'_>) -> Result<Option<Vec<Keyframe>>, LidarError> {
     let Some(times) = times(file, "pose_time_us")? else { return Ok(None) };
     let shape = [Some(times.len()), Some(4), Some(4)];
     // The shape ties the number of matrices to that of times.
-    let matrices = floats(file, "world_from_rig", &shape)?;
-    let matrices = matrices.ok_or(LidarError::Missing("world_from_rig"))?;
+    let matrices =
+        floats(file, "world_from_rig", &shape)?.ok_or(LidarError::Missing("world_from_rig"))?;
     if let Some(at) = times.windows(2).position(|pair| pair[1] <= pair[0]) {
         return Err(LidarError::Time(at + 1));
     }

@@ -139,8 +139,8 @@ impl<'a> Input<'a> {
     /// Mean over the decisions of the mean distance between plan and recorded drive, at the steps
     /// up to a time ahead.
     fn ade(&self, delta_us: i64) -> Measured {
-        let reference = self.record.reference.as_ref();
-        let reference = reference.ok_or(Missing::new("needs the recorded drive"))?;
+        let reference =
+            self.record.reference.as_ref().ok_or(Missing::new("needs the recorded drive"))?;
         let found = mean(
             self.plans.iter().filter_map(|plan| self.average_error_m(plan, reference, delta_us)),
         );

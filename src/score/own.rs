@@ -252,8 +252,8 @@ fn least_ttc_s(record: &DriveRecord) -> Option<f64> {
         let own =
             Moving { footprint: shape.footprint(&ego), velocity_mps: ego.world_velocity_mps() };
         tracks.iter().filter_map(move |track: &Track| {
-            let other = track.samples.get(step).copied().flatten()?;
-            let other = Moving { footprint: other.footprint, velocity_mps: other.velocity_mps };
+            let sample = track.samples.get(step).copied().flatten()?;
+            let other = Moving { footprint: sample.footprint, velocity_mps: sample.velocity_mps };
             time_to_contact_s(&own, &other)
         })
     };

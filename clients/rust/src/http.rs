@@ -112,8 +112,8 @@ impl HttpClient {
 
         let mut headers = HeaderMap::new();
         if let Some(token) = &options.token {
-            let bearer = HeaderValue::try_from(format!("Bearer {token}"));
-            let mut bearer = bearer.map_err(|_| HttpError::Token)?;
+            let mut bearer =
+                HeaderValue::try_from(format!("Bearer {token}")).map_err(|_| HttpError::Token)?;
             bearer.set_sensitive(true);
             headers.insert(AUTHORIZATION, bearer);
         }
@@ -215,9 +215,9 @@ impl HttpClient {
         let DriveSection { name, from_m, to_m, every_m } = section;
         let path = ["v1", "twins", twin, "trajectories", name];
         let version = version.map(|number| ("version", number.to_string()));
-        let stations = [("from_m", from_m), ("to_m", to_m), ("every_m", every_m)];
+        let fields = [("from_m", from_m), ("to_m", to_m), ("every_m", every_m)];
         let stations =
-            stations.into_iter().filter_map(|(field, value)| Some((field, (*value)?.to_string())));
+            fields.into_iter().filter_map(|(field, value)| Some((field, (*value)?.to_string())));
         let mut url = self.url(&path);
         url.query_pairs_mut().extend_pairs(version.into_iter().chain(stations));
         let answer = self.send(self.http.request(Method::GET, url), limits::HTTP_TIMEOUT).await?;

@@ -41,8 +41,9 @@ impl Many {
             let result = match (tensor, error) {
                 (None, Some(refusal)) => Err(refusal),
                 (Some(name), None) => {
-                    let info = tensors.info(&name);
-                    let info = info.ok_or_else(|| FrameError::Missing { name: name.clone() })?;
+                    let info = tensors
+                        .info(&name)
+                        .ok_or_else(|| FrameError::Missing { name: name.clone() })?;
                     if info.dtype != Dtype::U8 || info.shape.len() != 1 {
                         return Err(FrameError::Tensor {
                             name,

@@ -149,11 +149,11 @@ impl Observation {
         let mut frame_hasher = blake3::Hasher::new();
         for image in self.images() {
             image.verify()?;
-            let hash = &image.metadata.hash;
+            let text = &image.metadata.hash;
             // A text that is not a hash equals no hash.
-            let hash = blake3::Hash::from_hex(hash).map_err(|_| FrameError::Hash {
+            let hash = blake3::Hash::from_hex(text).map_err(|_| FrameError::Hash {
                 name: image.metadata.tensor.clone(),
-                found: hash.clone(),
+                found: text.clone(),
                 expected: "64 hex digits".to_owned(),
             })?;
             // Of the images' hashes and not of their pixels, so that it can be compared for JPEG

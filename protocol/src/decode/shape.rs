@@ -61,9 +61,11 @@ impl Shapes {
     /// The schema has a keyword that this module does not support. A test reads every schema.
     pub(super) fn from_schema(schema: &str) -> Self {
         let schema: Value = serde_json::from_str(schema).expect("a schema is JSON");
-        let definitions = schema["$defs"].as_object().into_iter().flatten();
-        let definitions =
-            definitions.map(|(name, schema)| (name.clone(), Shape::from_value(schema)));
+        let definitions = schema["$defs"]
+            .as_object()
+            .into_iter()
+            .flatten()
+            .map(|(name, schema)| (name.clone(), Shape::from_value(schema)));
         Self { root: Shape::from_value(&schema), definitions: definitions.collect() }
     }
 

@@ -133,8 +133,9 @@ impl From<PoseError> for BridgeError {
 pub async fn drive_episode(settings: &EpisodeSettings) -> Result<EpisodeReport, BridgeError> {
     // The driver first: it may take minutes to load, and a session would wait for it.
     let uuid = format!("wildcity-{}-{}", std::process::id(), settings.seed);
-    let driver = Driver::connect(&settings.driver, uuid, settings.max_wait).await;
-    let mut driver = driver.map_err(BridgeError::Driver)?;
+    let mut driver = Driver::connect(&settings.driver, uuid, settings.max_wait)
+        .await
+        .map_err(BridgeError::Driver)?;
 
     let options = ConnectOptions::with_token(settings.token.clone());
     let mut client = Client::connect_with(&settings.server, "wildcity-egodriver", &options).await?;

@@ -71,9 +71,9 @@ impl Driver {
         let origin: Uri = format!("http://{address}").parse().map_err(no_address)?;
         // The wait for the first connection is longer than that for an answer: the network is
         // loaded then.
-        let channel = Channel::connect(address, limits::DRIVER_START).await;
-        let channel =
-            channel.map_err(|reason| DriverError::Lost(format!("{address}: {reason}")))?;
+        let channel = Channel::connect(address, limits::DRIVER_START)
+            .await
+            .map_err(|reason| DriverError::Lost(format!("{address}: {reason}")))?;
         let mut driver = Self { grpc: Grpc::with_origin(channel, origin), uuid, max_wait };
         let version: common::VersionId = driver.call("get_version", common::Empty {}).await?;
         tracing::info!(driver = version.version_id, "connected");

@@ -42,8 +42,9 @@ pub(crate) async fn ground_intersection(
         let drives = &scene.resident.version.manifest.trajectories;
         answer(drives, &scene.frame, &asked)
     };
-    let answered = tokio::task::spawn_blocking(work).await;
-    let answered = answered.map_err(|error| Status::internal(error.to_string()))?;
+    let answered = tokio::task::spawn_blocking(work)
+        .await
+        .map_err(|error| Status::internal(error.to_string()))?;
     Ok(answered?)
 }
 

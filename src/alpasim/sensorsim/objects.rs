@@ -128,8 +128,7 @@ impl ObjectAssets {
         if let Some(asset) = self.known(key) {
             return Ok(asset);
         }
-        let made = shape.box_asset();
-        let made = made.map_err(|error| SensorsimError::Invalid(error.to_string()))?;
+        let made = shape.box_asset().map_err(|error| SensorsimError::Invalid(error.to_string()))?;
         if let Some(box_asset) = made {
             return self.load(key, || engine.hold_actor(key, box_asset.clone()));
         }
@@ -167,8 +166,8 @@ impl ObjectAssets {
         // The oldest leaves. 384 entries are searched in microseconds, so no list in order of use
         // is kept.
         if !known.contains_key(key) && known.len() >= limits::OBJECT_ASSETS {
-            let oldest = known.iter().min_by_key(|(_, (_, drawn))| *drawn);
-            let oldest = oldest.map(|(key, _)| key.clone());
+            let oldest =
+                known.iter().min_by_key(|(_, (_, drawn))| *drawn).map(|(key, _)| key.clone());
             oldest.and_then(|key| known.remove(&key));
         }
         known.insert(key.to_owned(), (asset.clone(), Instant::now()));

@@ -120,9 +120,11 @@ impl ViewSessions {
                 (plain?, Some(repaired?))
             }
         };
-        let drawn =
-            plain.images().enumerate().map(|(at, image)| drawn(image, repaired.as_ref(), at));
-        let drawn = drawn.collect::<anyhow::Result<Vec<Drawn>>>();
+        let drawn = plain
+            .images()
+            .enumerate()
+            .map(|(at, image)| drawn(image, repaired.as_ref(), at))
+            .collect::<anyhow::Result<Vec<Drawn>>>();
         drawn.with_context(|| format!("{} at {} m", place.trajectory, place.station_m))
     }
 

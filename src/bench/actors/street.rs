@@ -48,14 +48,18 @@ pub(super) fn commit(
     into: &Catalog,
 ) -> anyhow::Result<Cars> {
     let manifest = &version.manifest;
-    let drive = manifest.trajectories.first();
-    let drive = drive.with_context(|| format!("twin {:?} has no trajectory", manifest.twin))?;
+    let drive = manifest
+        .trajectories
+        .first()
+        .with_context(|| format!("twin {:?} has no trajectory", manifest.twin))?;
     let places = places(drive, count).with_context(|| format!("twin {:?}", manifest.twin))?;
     let rig = manifest.rig.clone().or_else(|| Rig::preset(wildcity_session::limits::RIG));
 
     // The car.
-    let model = actor_models().into_iter().find(|model| model.name == "sedan");
-    let model = model.context("there is no generated sedan")?;
+    let model = actor_models()
+        .into_iter()
+        .find(|model| model.name == "sedan")
+        .context("there is no generated sedan")?;
     let car = refined(model.gaussians, gaussians as usize);
     let provenance = Provenance::new(format!("sedan of {} Gaussians", car.len()));
     let description = AssetDescription {
@@ -64,8 +68,8 @@ pub(super) fn commit(
         box_: model.box_,
         provenance: provenance.clone(),
     };
-    let asset = ActorAsset::new(&car, description)?;
-    let asset = into.put_actor(&asset, manifest.record)?.hash;
+    let made = ActorAsset::new(&car, description)?;
+    let asset = into.put_actor(&made, manifest.record)?.hash;
 
     // The twins.
     let mut all = Gaussians { sh_degree: manifest.sh_degree, ..Gaussians::default() };

@@ -137,8 +137,10 @@ impl Demo {
             demo_twin(&twins, SPOILED_TWIN, StorageOptions::default(), Some(SPOILED_BY))?;
         }
         // Uploads are needed until they are pushed, and the viewer of --view pushes some.
-        let uploads = tempfile::Builder::new().prefix(".uploads").tempdir_in(&self.out);
-        let uploads = uploads.with_context(|| format!("cannot write to {}", self.out.display()))?;
+        let uploads = tempfile::Builder::new()
+            .prefix(".uploads")
+            .tempdir_in(&self.out)
+            .with_context(|| format!("cannot write to {}", self.out.display()))?;
         let directories = Directories {
             twins,
             episodes: self.out.join("episodes"),

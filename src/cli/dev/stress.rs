@@ -73,8 +73,11 @@ impl BackendName {
 
 impl Stress {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        let backends = self.backends.iter().map(|name| candidate(*name, &self.hardware));
-        let backends = backends.collect::<anyhow::Result<Vec<Candidate>>>()?;
+        let backends = self
+            .backends
+            .iter()
+            .map(|name| candidate(*name, &self.hardware))
+            .collect::<anyhow::Result<Vec<Candidate>>>()?;
         let all = || CASES.iter().collect();
         let cases = if self.cases.is_empty() { all() } else { self.cases };
         let bar = progress::state();

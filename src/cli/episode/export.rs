@@ -152,8 +152,11 @@ impl Export {
         let rig = EpisodeFile::rig(path)?;
         let mut recording = RecordedEpisode::read(path)?;
         let count = recording.header.rig.cameras.len();
-        let wanted = self.camera.iter().map(|name| camera_index(&recording, name));
-        let mut wanted = wanted.collect::<anyhow::Result<Vec<usize>>>()?;
+        let mut wanted = self
+            .camera
+            .iter()
+            .map(|name| camera_index(&recording, name))
+            .collect::<anyhow::Result<Vec<usize>>>()?;
         if wanted.is_empty() && self.images {
             wanted = (0..count).collect();
         }

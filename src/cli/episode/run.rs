@@ -137,13 +137,13 @@ impl Run {
             .map_err(|reason| bad_input(format!("--accept-unjudged: {reason}")))?;
         let accept_unjudged =
             [suite.accept_unjudged.clone(), self.accept_unjudged.clone()].concat();
-        let agent = self.agent.clone().or(suite.agent.clone()).unwrap_or("log".to_owned());
-        let agent = choice(&agent)?;
+        let named = self.agent.clone().or(suite.agent.clone()).unwrap_or("log".to_owned());
+        let agent = choice(&named)?;
         let catalog = self.twins.catalog()?;
         let options = CaseOptions { latest: self.latest, bare: self.bare };
         let cases = cases(&suite, &scenarios, &catalog, options).map_err(bad_input)?;
-        let before = self.against.as_deref().map(SuiteResult::read).transpose();
-        let before = before.map_err(bad_input)?;
+        let before =
+            self.against.as_deref().map(SuiteResult::read).transpose().map_err(bad_input)?;
         let rule: Rule = self.worse_by.iter().cloned().collect();
         if let Some(before) = &before {
             Comparison::check(before, &cases, &rule).map_err(bad_input)?;

@@ -163,8 +163,11 @@ impl Resolved {
 
     fn write_value(&self, text: &mut String, option: &Arg) -> anyhow::Result<()> {
         let id = option.get_id().as_str();
-        let help = option.get_long_help().or(option.get_help());
-        let help = help.map(ToString::to_string).unwrap_or_default();
+        let help = option
+            .get_long_help()
+            .or(option.get_help())
+            .map(ToString::to_string)
+            .unwrap_or_default();
         // Writing to a String does not fail.
         let _ = writeln!(text);
         for line in help.lines().flat_map(wrapped) {
@@ -183,8 +186,11 @@ impl Resolved {
 
     /// The text of an option that is in effect: given, or a default.
     fn value(&self, id: &str) -> anyhow::Result<Option<String>> {
-        let given = self.matches.get_raw(id).and_then(|mut values| values.next_back());
-        let given = given.map(|value| value.to_string_lossy().into_owned());
+        let given = self
+            .matches
+            .get_raw(id)
+            .and_then(|mut values| values.next_back())
+            .map(|value| value.to_string_lossy().into_owned());
         match given {
             Some(given) => Ok(Some(given)),
             None => self.serve.default_value(id),
@@ -204,8 +210,9 @@ fn literal(text: &str) -> Value {
 
 /// The lines of a comment.
 fn wrapped(line: &str) -> Vec<Cow<'_, str>> {
-    let options = textwrap::Options::new(98).break_words(false);
-    let options = options.word_splitter(textwrap::WordSplitter::NoHyphenation);
+    let options = textwrap::Options::new(98)
+        .break_words(false)
+        .word_splitter(textwrap::WordSplitter::NoHyphenation);
     textwrap::wrap(line, options.word_separator(textwrap::WordSeparator::AsciiSpace))
 }
 

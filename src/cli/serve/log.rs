@@ -107,8 +107,11 @@ mod otlp {
             // The exporter's HTTP client has no TLS provider. Another part of the program may have
             // installed one already.
             let _ = rustls::crypto::ring::default_provider().install_default();
-            let exporter = SpanExporter::builder().with_http().with_endpoint(url).build();
-            let exporter = exporter.with_context(cannot)?;
+            let exporter = SpanExporter::builder()
+                .with_http()
+                .with_endpoint(url)
+                .build()
+                .with_context(cannot)?;
             let batches = BatchConfigBuilder::default()
                 .with_max_queue_size(WAITING_SPANS)
                 .with_scheduled_delay(SENT_EVERY)

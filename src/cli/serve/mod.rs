@@ -255,8 +255,8 @@ impl Serve {
         let tokens = self
             .tokens
             .as_deref()
-            .map(|path| Tokens::read(path).with_context(|| format!("--tokens {}", path.display())));
-        let tokens = tokens.transpose()?;
+            .map(|path| Tokens::read(path).with_context(|| format!("--tokens {}", path.display())))
+            .transpose()?;
         let tls = match (self.tls_cert, self.tls_key) {
             (Some(cert), Some(key)) => Some(TlsFiles { cert, key }),
             (None, None) => None,

@@ -160,8 +160,8 @@ impl Block {
         let seeing: Vec<usize> =
             (0..recorded.count()).filter(|&index| sees_one(&parts.own_m, index)).collect();
         // Images that see both sides of a border show whether the blocks fit each other.
-        let across = seeing.iter().copied().filter(|&index| sees_one(&parts.halo_m, index));
-        let across = ChosenImages { all: recorded, chosen: across.collect() };
+        let see_both = seeing.iter().copied().filter(|&index| sees_one(&parts.halo_m, index));
+        let across = ChosenImages { all: recorded, chosen: see_both.collect() };
         let images = ChosenImages { all: recorded, chosen: seeing };
         ensure!(
             images.count() > 0,

@@ -165,8 +165,10 @@ impl Compare {
 /// The command that makes one of the runs, but for its size, steps and cap: that of a comparison
 /// with its other options.
 fn command_of_a_run(arguments: impl Iterator<Item = OsString>) -> String {
-    let words = arguments.map(|word| word.to_string_lossy().into_owned());
-    let mut words = words.skip_while(|word| word != "compare").skip(1);
+    let mut words = arguments
+        .map(|word| word.to_string_lossy().into_owned())
+        .skip_while(|word| word != "compare")
+        .skip(1);
     let mut command = "wildcity train".to_owned();
     while let Some(word) = words.next() {
         let (name, has_value) = match word.split_once('=') {

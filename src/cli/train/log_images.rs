@@ -222,8 +222,8 @@ impl LogImages {
             let size_px = [width, height];
             let mask = picture::mask(&file, size_px)?;
             // The mask has the size of its image, which may be smaller than the calibrated one.
-            let camera = self.log.rig.cameras[place.camera].camera;
-            let camera = camera.scaled(width.into(), height.into())?;
+            let camera =
+                self.log.rig.cameras[place.camera].camera.scaled(width.into(), height.into())?;
             let camera_from_world = self.rig.world_from_camera(*place).inverse();
             for (point_m, votes) in points_m.iter().zip(&mut votes) {
                 let at_m = camera_from_world.transform_point(*point_m);
@@ -283,8 +283,10 @@ impl LogImages {
         let depth_m = self.depths(row, place.camera, &view)?;
         let exposure = factor(row.exposure_stops);
         let Shrunk { rgb8, mask, own_px, .. } = shrunk;
-        let sky = row.sky_mask.as_deref().map(|file| picture::mask(&path(file), own_px));
-        let sky = sky
+        let sky = row
+            .sky_mask
+            .as_deref()
+            .map(|file| picture::mask(&path(file), own_px))
             .transpose()?
             .map(|sky| shrink(&sky, own_px, [view.camera.width_px, view.camera.height_px]));
         Ok(TrainingImage { view, rgb8, mask, sky, depth_m, weight: 1.0, exposure })

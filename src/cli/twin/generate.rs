@@ -153,8 +153,8 @@ impl Generate {
 fn check_free_space(dir: &Path, gaussians: u64) -> anyhow::Result<()> {
     // The directory may not exist yet; then its nearest parent is on the same disk.
     let existing = dir.ancestors().find(|dir| dir.is_dir()).unwrap_or(Path::new("."));
-    let disk = rustix::fs::statvfs(existing);
-    let disk = disk.with_context(|| format!("cannot read the free space of {}", dir.display()))?;
+    let disk = rustix::fs::statvfs(existing)
+        .with_context(|| format!("cannot read the free space of {}", dir.display()))?;
     let free_bytes = disk.f_bavail.saturating_mul(disk.f_frsize);
     let needed_bytes = gaussians.saturating_mul(STORED_BYTES);
     let gib = |bytes: u64| bytes as f64 / f64::from(1 << 30);

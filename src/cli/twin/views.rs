@@ -154,8 +154,8 @@ impl Views {
                     None => placement::from_version(&catalog, &base)?,
                 };
                 listed = list.every(1).len();
-                let views = self.put(&mut commit, manifest, &list, &alignment)?;
-                let views = commit.put_views(&views)?;
+                let stored = self.put(&mut commit, manifest, &list, &alignment)?;
+                let views = commit.put_views(&stored)?;
                 commit.set_views(Some(views));
             }
         }
@@ -252,8 +252,8 @@ impl Views {
         let (mut rgb8, mut camera) = picture::real(&image.file, &image.camera, background)?;
         let width = camera.width_px;
         let height = camera.height_px;
-        let mask = image.mask.as_deref();
-        let mask = mask.map(|file| picture::mask(file, [width, height])).transpose()?;
+        let mask =
+            image.mask.as_deref().map(|file| picture::mask(file, [width, height])).transpose()?;
         let outside = own_vehicle::outside(manifest.rig.as_ref(), camera_name, [width, height]);
         let mut counts = own_vehicle::both(mask, outside);
         let longest = width.max(height);
@@ -265,8 +265,8 @@ impl Views {
             let small = [scaled(width), scaled(height)];
             camera = camera.scaled(small[0].into(), small[1].into())?;
             camera.native_size_px = None;
-            let large = RgbImage::from_raw(width, height, rgb8);
-            let large = large.context("an image has 3 bytes per pixel")?;
+            let large = RgbImage::from_raw(width, height, rgb8)
+                .context("an image has 3 bytes per pixel")?;
             // Lanczos keeps fine edges, which a box filter would blur.
             rgb8 = imageops::resize(&large, small[0], small[1], FilterType::Lanczos3).into_raw();
             counts = counts.map(|counts| reduced_mask(&counts, [width, height], small));

@@ -69,8 +69,10 @@ impl Builder<'_, '_> {
     /// An actor: on its trajectory, through timed positions, standing, along its lane, or straight
     /// on.
     pub(super) fn actor_section(&self, entity: &Entity) -> Result<ActorSection, String> {
-        let place = entity.place.or_else(|| first_place(entity.line.as_ref()?));
-        let place = place.ok_or("has no position in <Init>; add a <TeleportAction>")?;
+        let place = entity
+            .place
+            .or_else(|| first_place(entity.line.as_ref()?))
+            .ok_or("has no position in <Init>; add a <TeleportAction>")?;
         let time_s = self.end_s.unwrap_or(USUAL_S);
         let fastest_mps = entity.fastest_mps.max(entity.begin_mps);
         // As far as the actor can come until the end. Of a standing actor, 100 m are left for its
@@ -137,8 +139,10 @@ impl Builder<'_, '_> {
         if self.end_s.is_none_or(|end_s| times_s.last().is_some_and(|last_s| *last_s < end_s)) {
             self.note(entity, "stands at the end of its timed trajectory");
         }
-        let positions = points.iter().zip(times_s);
-        let positions = positions.map(|(xyz, time_s)| TimedPosition { time_s: *time_s, xyz: *xyz });
+        let positions = points
+            .iter()
+            .zip(times_s)
+            .map(|(xyz, time_s)| TimedPosition { time_s: *time_s, xyz: *xyz });
         CollideSection {
             positions: Some(positions.collect()),
             yaw_rad: Some(place.yaw_rad),

@@ -63,11 +63,12 @@ pub(super) fn distance(
         Some("leadingReferencedEntity") => Some(SideSection::Ahead),
         Some(other) => return Err(action.wrong(&format!("displacement={other:?} is not read"))),
     };
-    let free = action.find_flag("freespace")?;
-    let free = free.ok_or_else(|| action.wrong("the attribute freespace is missing"))?;
-    let continuous = action.find_flag("continuous")?;
-    let continuous =
-        continuous.ok_or_else(|| action.wrong("the attribute continuous is missing"))?;
+    let free = action
+        .find_flag("freespace")?
+        .ok_or_else(|| action.wrong("the attribute freespace is missing"))?;
+    let continuous = action
+        .find_flag("continuous")?
+        .ok_or_else(|| action.wrong("the attribute continuous is missing"))?;
     let mut section = KeepDistanceSection {
         of: context.actor_name(&of),
         gap_m,

@@ -92,8 +92,8 @@ fn up_to(points: &[[f64; 3]], point: [f64; 3]) -> Option<Vec<[f64; 3]>> {
         let way = flat(pair[1]) - from;
         // The foot of the point on this piece, as a share of its length. `max` is for two equal
         // points, where 0 / 0 would be NaN.
-        let t = (flat(point) - from).dot(way) / way.length_squared().max(1e-12);
-        let t = t.clamp(0.0, 1.0);
+        let share = (flat(point) - from).dot(way) / way.length_squared().max(1e-12);
+        let t = share.clamp(0.0, 1.0);
         ((from + t * way).distance(flat(point)), index, t)
     });
     let places: Vec<(f64, usize, f64)> = places.collect();

@@ -74,8 +74,7 @@ fn roads<'c>(kind: &Element<'_>, context: &'c Context<'_>) -> Result<&'c RoadMap
 /// The entity of `entityRef`, and its place.
 fn base_place(kind: &Element<'_>, context: &Context<'_>) -> Result<(String, Place), ConvertError> {
     let name = kind.text("entityRef")?;
-    let place = context.entities.get(&name).and_then(|entity| entity.place);
-    let place = place.ok_or_else(|| {
+    let place = context.entities.get(&name).and_then(|entity| entity.place).ok_or_else(|| {
         kind.wrong(&format!("{name:?} has no position before this one; place it first"))
     })?;
     Ok((name, place))
@@ -100,8 +99,9 @@ fn lane_place(kind: &Element<'_>, context: &Context<'_>) -> Result<Place, Conver
     let s = kind.number("s")?;
     let offset = kind.number_or_0("offset")?;
     let lane = kind.whole("laneId")?;
-    let at = roads.place(&kind.text("roadId")?, lane, s, offset);
-    let at = at.map_err(|message| kind.wrong(&message))?;
+    let at = roads
+        .place(&kind.text("roadId")?, lane, s, offset)
+        .map_err(|message| kind.wrong(&message))?;
     lane_facing(kind, at, roads)
 }
 

@@ -131,9 +131,9 @@ impl Line {
         let step = place.step_back();
         // The step is applied after the shift: so the view before is as far beside the drive as
         // this one, also in a curve.
-        let before =
-            step.map(|step| draw(tools, image, place, &|pose| step * moved(pose, moved_m), None));
-        let before = before.transpose()?;
+        let before = step
+            .map(|step| draw(tools, image, place, &|pose| step * moved(pose, moved_m), None))
+            .transpose()?;
         let kept = before.as_ref().and_then(|before| before.nearest.as_deref());
         let now = draw(tools, image, place, &|pose| moved(pose, moved_m), kept)?;
 

@@ -60,8 +60,13 @@ impl Repairer {
         let name = &model.manifest().name;
         let references = match source {
             OpenScene::Twin(resident) => {
-                let cameras = resident.version.manifest.rig.as_ref().map(|rig| &rig.cameras[..]);
-                let cameras = cameras.unwrap_or_default();
+                let cameras = resident
+                    .version
+                    .manifest
+                    .rig
+                    .as_ref()
+                    .map(|rig| &rig.cameras[..])
+                    .unwrap_or_default();
                 let catalog = catalog.context("a twin is in a catalog")?.clone();
                 let references =
                     OfflineReferences::open(resident.clone(), catalog, cameras, held_out)?;

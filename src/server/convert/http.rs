@@ -119,8 +119,8 @@ pub(super) fn requested_files(files: Vec<http::PushFile>) -> Result<Vec<Requeste
 }
 
 fn requested_file(index: usize, file: http::PushFile) -> Result<RequestedFile, PushError> {
-    let axes = SourceAxes::given(file.axes.as_deref(), file.scale);
-    let axes = axes.map_err(|error| {
+    let given = SourceAxes::given(file.axes.as_deref(), file.scale);
+    let axes = given.map_err(|error| {
         // Both are read together, so that the error has to say which one it is about.
         let part = match error {
             IngestError::InvalidAxes { option: "--scale", .. } => "scale",

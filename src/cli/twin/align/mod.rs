@@ -168,9 +168,10 @@ impl Align {
             writeln!(output::stdout(), "cameras     {height_m:.2} m above the ground (median)")?;
         }
 
-        let picture = self.picture.clone();
-        let picture =
-            picture.unwrap_or_else(|| format!("{}-align.png", self.edited.twin.name).into());
+        let picture = self
+            .picture
+            .clone()
+            .unwrap_or_else(|| format!("{}-align.png", self.edited.twin.name).into());
         // Before the version is written: the picture shows whether the proposal is right.
         let (png, step_m) =
             picture::before_and_after(gaussians, &alignment, base.manifest.profile)?;

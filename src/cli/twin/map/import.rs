@@ -41,8 +41,8 @@ pub(in crate::cli) struct Import {
 impl Import {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let context = || format!("{}", self.file.display());
-        let bytes = ingest::read_whole(&self.file, wildcity_convert::TEXT_BYTES as u64);
-        let bytes = bytes.with_context(context)?;
+        let bytes = ingest::read_whole(&self.file, wildcity_convert::TEXT_BYTES as u64)
+            .with_context(context)?;
         anyhow::ensure!(
             // Both are XML of ASAM, and easily mixed up: the message names the command for the
             // other one.

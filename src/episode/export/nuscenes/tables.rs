@@ -255,8 +255,8 @@ impl Tables {
         // The origin of an actor is on the ground.
         let up = Pose { position_m: [0.0, 0.0, 0.5 * height].into(), ..Pose::IDENTITY };
         let center = state.world_from_actor * up;
-        let attributes = attribute(actor.class, state.velocity_mps.length() > MOVING_MPS);
-        let attributes = attributes.map(|index| self.token("attribute", index));
+        let attributes = attribute(actor.class, state.velocity_mps.length() > MOVING_MPS)
+            .map(|index| self.token("attribute", index));
         let row = json!({
             "token": self.token("sample_annotation", this),
             "sample_token": self.token("sample", sample),
