@@ -83,7 +83,7 @@ impl Walk<'_> {
                     let reason = "write an integer of this size without a point or an exponent";
                     return Err(self.wrong(reason));
                 }
-                // Every accepted range is one of u64 or i64: what is not the first is the second.
+                // Every accepted range is within u64 or i64: what is not the first is the second.
                 let unsigned = u64::try_from(whole).map(Value::from);
                 Ok(unsigned.unwrap_or_else(|_| Value::from(whole as i64)))
             }

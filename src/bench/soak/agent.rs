@@ -73,7 +73,7 @@ impl Agent {
 
     /// Each session drives another part of the route.
     fn pose(&self, step: u32) -> Pose {
-        // A remainder of 0 would be NaN.
+        // A remainder of a division by 0 would be NaN.
         let length_m = self.route.length_m().max(f64::MIN_POSITIVE);
         // A share that is no simple fraction: few sessions meet at one place.
         let from_m = f64::from(self.number) * 0.37 * length_m;

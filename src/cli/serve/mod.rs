@@ -240,7 +240,7 @@ impl Serve {
             // An unknown or damaged twin is reported here, and not by the page.
             catalog.version(twin, None)?;
         }
-        // A damaged twin is said and left out: the others are served.
+        // A damaged twin is reported and left out: the others are served.
         let found = catalog.twins()?;
         for DamagedTwin { name, error } in &found.damaged {
             tracing::error!(twin = name, "damaged, not served: {error}");
