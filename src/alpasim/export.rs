@@ -92,7 +92,6 @@ pub struct SceneContent<'a> {
     pub cameras: &'a [RigCamera],
     /// Its recorded traffic. A track with an asset has the size of the asset.
     pub tracks: Option<&'a TracksFile>,
-    /// Length in seconds.
     pub length_s: f64,
 }
 

@@ -225,7 +225,8 @@ fn gaussians(size: ActorBox, rgb8: [u8; 3]) -> Gaussians {
         // The inverse of colour = 0.5 + C0 dc.
         let dc = rgb.map(|value| ((value - 0.5) / sh::C0) as f32);
         // The two axes within the face.
-        let [u, v] = [(axis + 1) % 3, (axis + 2) % 3];
+        let u = (axis + 1) % 3;
+        let v = (axis + 2) % 3;
         for i in 0..cells[u] as usize {
             for j in 0..cells[v] as usize {
                 // From the middle of the box.

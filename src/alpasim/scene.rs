@@ -99,8 +99,8 @@ impl SceneId {
     /// # Errors
     /// The version has no such drive, or the start is not on it.
     pub fn drive<'a>(&self, manifest: &'a Manifest) -> Result<&'a Trajectory, SceneError> {
-        let drive = manifest.trajectories.iter().find(|drive| drive.name == self.trajectory);
-        let drive = drive.ok_or_else(|| SceneError::Trajectory {
+        let found = manifest.trajectories.iter().find(|drive| drive.name == self.trajectory);
+        let drive = found.ok_or_else(|| SceneError::Trajectory {
             twin: self.twin.clone(),
             trajectory: self.trajectory.clone(),
         })?;
@@ -149,14 +149,14 @@ impl LocalFrame {
     ) -> Result<Pose, SceneError> {
         let pose = pose.ok_or(SceneError::Missing { field })?;
         // A pose without a quaternion is not taken for the identity: the field was forgotten.
-        let (Some(vec), Some(quat)) = (pose.vec, pose.quat) else {
+        let Some((vec, quat)) = pose.vec.zip(pose.quat) else {
             return Err(SceneError::Missing { field });
         };
         // To f64 before the origin is added, in which 100 km have 1e-11 m.
         let xyz_m = [vec.x, vec.y, vec.z].map(f64::from);
         let q_wxyz = [quat.w, quat.x, quat.y, quat.z].map(f64::from);
-        let local = Pose::checked(xyz_m, q_wxyz);
-        let local = local.map_err(|cause| SceneError::Pose { field, cause })?;
+        let local =
+            Pose::checked(xyz_m, q_wxyz).map_err(|cause| SceneError::Pose { field, cause })?;
         Ok(Pose { position_m: local.position_m + self.origin_m, ..local })
     }
 

@@ -50,7 +50,8 @@ impl CameraModel {
                 (Some(Self::Pinhole | Self::OpenCv), Self::Pinhole | Self::OpenCv) => Self::OpenCv,
                 (Some(common), own) => {
                     let camera = name.clone();
-                    let (model, other) = (own.name(), common.name());
+                    let model = own.name();
+                    let other = common.name();
                     return Err(AugmentError::MixedLenses { camera, model, other });
                 }
             });

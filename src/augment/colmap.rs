@@ -15,9 +15,9 @@ use crate::training_image::TrainingImage;
 /// How the files are written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ColmapForm {
-    /// cameras.txt, images.txt, points3D.txt.
+    /// The files cameras.txt, images.txt and points3D.txt.
     Text,
-    /// cameras.bin, images.bin, points3D.bin.
+    /// The files cameras.bin, images.bin and points3D.bin.
     Binary,
 }
 
@@ -79,7 +79,8 @@ impl ColmapModel<'_> {
     fn cameras_text(&self) -> String {
         let mut text = "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n".to_owned();
         for (id, camera) in (1..).zip(self.cameras) {
-            let [width, height] = [camera.camera.width_px, camera.camera.height_px];
+            let width = camera.camera.width_px;
+            let height = camera.camera.height_px;
             let _ = write!(text, "{id} {} {width} {height}", self.model.name());
             for value in self.parameters(camera) {
                 let _ = write!(text, " {value}");

@@ -19,7 +19,7 @@ pub enum AugmentError {
     )]
     Samples {
         samples: usize,
-        /// [`crate::limits::MOST_SAMPLES`].
+        /// The most samples of a round, [`crate::limits::MOST_SAMPLES`].
         limit: usize,
     },
     /// A camera's lens has no name in transforms.json and COLMAP.

@@ -8,7 +8,7 @@ use wildcity_scene::geometry::Pose;
 use crate::AugmentError;
 use crate::limits::{EVERY_M, MOST_OFFSET_M, MOST_ROUNDS, ROUND_M};
 
-/// Names have centimetres.
+/// Centimetres of a metre: names have distances to whole centimetres.
 const CM: f64 = 100.0;
 
 /// The views of one round: at regular distances along each drive, on both sides of it.

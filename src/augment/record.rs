@@ -9,7 +9,6 @@ use wildcity_scene::geometry::Pose;
 
 use crate::limits::WEIGHT;
 
-/// Format of augment.json.
 pub(crate) const FORMAT: &str = "wildcity.augment/1";
 
 /// Meaning of each folder and number, by its name.
@@ -79,9 +78,9 @@ pub struct Options {
     pub lenses: bool,
     /// Largest number of points of the COLMAP model, and the seed of their choice.
     pub points: u32,
-    /// See `points`.
+    /// Seed of the choice of `points`.
     pub seed: u64,
-    /// `txt` or `bin`.
+    /// Form of the COLMAP model: `txt` or `bin`.
     pub colmap: String,
 }
 
@@ -114,7 +113,7 @@ pub struct Sample {
     pub world_from_camera: Pose,
     /// Trust of the image, 0 to 1.
     pub trust: f64,
-    /// [`weight`].
+    /// Factor of the image's loss in a training, as [`weight`] gives it.
     pub weight: f64,
     /// Share of the pixels that count.
     pub counted: f64,
@@ -143,7 +142,7 @@ pub struct SampleFiles {
     pub rendered: Option<Vec<u8>>,
     /// 255 where pixels count.
     pub mask: Vec<u8>,
-    /// 16 bits, millimetres.
+    /// Distance along the camera's axis in millimetres, 16 bits a pixel.
     pub depth: Vec<u8>,
 }
 

@@ -74,6 +74,7 @@ impl Delivery {
         let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
         let costs = runtime.block_on(async {
             let running = wildcity_server::start(config).await?;
+            // The server is stopped whether or not measuring failed.
             let costs = self.measure(&running, &route).await;
             running.stop().await;
             costs
@@ -94,12 +95,15 @@ impl Delivery {
         bar.set_length(u64::from(self.rounds) + 1);
         let mut costs = Vec::new();
         for round in 0..=self.rounds {
+            // Half a metre a round: the view changes, and the same data stay in memory.
             let station_m = f64::from(round) * 0.5 % route.length_m();
             let pose = route.at(station_m).world_from_rig;
             let mut of_round = [Cost::default(); 4];
             for turn in 0..WAYS.len() {
                 // Each way comes first equally often.
                 let way = (turn + round as usize) % WAYS.len();
+                // Server and clients are in this process: the time of all threads has both sides of
+                // the socket.
                 let processor = threads_processor_time()?;
                 let begun = Instant::now();
                 ways.step(way, pose).await?;
@@ -119,8 +123,8 @@ impl Delivery {
 
     async fn ways(&self, running: &Running, start: Pose) -> anyhow::Result<Ways> {
         let engine = running.engine().clone();
-        let rig = Rig::preset(&self.rig);
-        let rig = rig.with_context(|| format!("there is no rig {:?}", self.rig))?;
+        let rig =
+            Rig::preset(&self.rig).with_context(|| format!("there is no rig {:?}", self.rig))?;
         let options = Open {
             rig: Some(RigChoice::Full(rig.clone().into())),
             ..self.twin.session(Outputs::colour(Encoding::Raw))
@@ -190,8 +194,9 @@ fn print(out: &mut impl Write, costs: &[[Cost; 4]]) -> io::Result<()> {
         };
         let wall_ms = median_ms(&|cost| cost.wall);
         let processor_ms = median_ms(&|cost| cost.processor);
-        let ratio = |round: &[Cost; 4]| round[way].processor.div_duration_f64(round[0].processor);
-        let ratio = median(costs.iter().map(ratio));
+        // Within a round, so that a clock that rises during the measurement does not matter.
+        let share = |round: &[Cost; 4]| round[way].processor.div_duration_f64(round[0].processor);
+        let ratio = median(costs.iter().map(share));
         writeln!(out, "{name:<15} {wall_ms:>10.1} {processor_ms:>14.1} {ratio:>18.3}")?;
     }
     Ok(())

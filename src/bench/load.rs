@@ -77,6 +77,7 @@ impl Load {
         let bar = progress::count("reading");
         let kinds = if self.file.is_some() { 4 } else { 3 };
         bar.set_length(kinds);
+        // First, because the other lines are compared with it.
         let mut lines = vec![Line {
             what: "bare bytes".into(),
             bytes,
@@ -109,6 +110,7 @@ impl Load {
 
     /// Median time of reading, in seconds.
     fn time(&self, mut read: impl FnMut() -> anyhow::Result<()>) -> anyhow::Result<f64> {
+        // Fills the page cache, so that every timed reading finds the same state.
         if !self.cold {
             read()?;
         }
@@ -144,6 +146,8 @@ fn read_decoded(
 ) -> anyhow::Result<()> {
     let next = AtomicUsize::new(0);
     let read = || -> anyhow::Result<()> {
+        // One counter for all threads: sections differ in size, and equal shares would end at
+        // different times. Relaxed, because the number carries no other data.
         while let Some((chunk, section)) = sections.get(next.fetch_add(1, Ordering::Relaxed)) {
             std::hint::black_box(catalog.section(version, chunk, section)?);
         }

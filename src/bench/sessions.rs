@@ -111,9 +111,10 @@ impl Sessions {
         manifest: &Manifest,
         count: u32,
     ) -> anyhow::Result<Row> {
-        let trajectory = manifest.trajectories.first();
-        let trajectory =
-            trajectory.with_context(|| format!("twin {:?} has no trajectory", manifest.twin))?;
+        let trajectory = manifest
+            .trajectories
+            .first()
+            .with_context(|| format!("twin {:?} has no trajectory", manifest.twin))?;
         let route = Route::new(trajectory)?;
         // Poses along the route, one per step.
         let count_of_poses = (route.length_m() / Driver::STEP_M) as usize + 1;
@@ -122,6 +123,7 @@ impl Sessions {
             .collect();
         let mut drivers = Vec::new();
         for number in 0..count {
+            // Spread evenly: at one place all sessions would need the same parts of the twin.
             let at = poses.len() * number as usize / count as usize;
             let name = format!("bench-{number}");
             let options = self.options(manifest)?;
@@ -140,6 +142,8 @@ impl Sessions {
         for task in tasks {
             steps.extend(task.await??);
         }
+        // Measured to the end of the last step, which may be after `end`: all its steps are
+        // counted.
         let took = begun.elapsed();
         let processor = processor_time()?.saturating_sub(processor_before);
         anyhow::ensure!(!steps.is_empty(), "no step ended within {} s", self.seconds);
@@ -191,7 +195,7 @@ struct Driver {
 }
 
 impl Driver {
-    /// 30 m/s.
+    /// Distance of a step, in metres: 30 m/s at ten steps per second.
     const STEP_M: f64 = 3.0;
 
     /// Steps until the given moment. Starts over at the end of the route.

@@ -38,6 +38,7 @@ pub(super) fn time(
         bar.inc(1);
     }
     bar.finish_and_clear();
+    // At least one frame was rendered. Counts are the same in all, and only the times differ.
     let mut stats = all[0].clone();
     for (name, ms) in &mut stats.stages_ms {
         let of = |stats: &FrameStats| {
@@ -61,5 +62,6 @@ pub(super) fn median(values: impl Iterator<Item = f64>) -> f64 {
     values.sort_by(f64::total_cmp);
     let at = |index: usize| values.get(index).copied().unwrap_or(f64::NAN);
     let last = values.len().saturating_sub(1);
+    // Of an odd number both places are the same.
     0.5 * (at(last / 2) + at(values.len() / 2))
 }

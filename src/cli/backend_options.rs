@@ -150,6 +150,7 @@ impl BackendOptions {
     pub fn backend(&self) -> anyhow::Result<Box<dyn Backend>> {
         match (self.backend, &self.hardware.device) {
             (BackendName::Auto, None) => self.hardware.best(),
+            // A device that is named asks for the GPU: the choice is no longer automatic.
             (BackendName::Auto | BackendName::Gpu, _) => Ok(Box::new(self.hardware.gpu()?)),
             (_, Some(device)) => anyhow::bail!(
                 "--device {device:?} belongs to the gpu backend: add --backend gpu, or omit --device"
@@ -174,6 +175,7 @@ impl BackendOptions {
     /// Creates the backend that rendered a recording, unless `--backend` names another one.
     pub fn replay_backend(&self, recorded: &str) -> anyhow::Result<Box<dyn Backend>> {
         let recorded = BackendName::from_str(recorded, false);
+        // Another backend may draw other bits, and the hashes of a replay would differ.
         match (self.backend, recorded) {
             (BackendName::Auto, Ok(backend)) => Self { backend, ..self.clone() }.backend(),
             _ => self.backend(),
@@ -252,11 +254,13 @@ impl HardwareOptions {
     /// Every backend that computes gradients here: cpu, and gpu if `--device` names a device or the
     /// machine has a hardware device.
     pub fn differentiating(&self) -> anyhow::Result<Vec<Box<dyn Differentiate>>> {
+        // In this order, because `training` takes the last one.
         #[allow(unused_mut, reason = "a build without gpu adds none")]
         let mut backends: Vec<Box<dyn Differentiate>> = vec![Box::new(self.cpu()?)];
         #[cfg(feature = "gpu")]
         match self.gpu_or(AdapterChoice::Hardware) {
             Ok(gpu) => backends.push(Box::new(gpu)),
+            // A machine without a GPU trains on its processor; a device that is named must exist.
             Err(GpuError::NoAdapter) if self.device.is_none() => {}
             Err(error) => return Err(error.into()),
         }
@@ -289,7 +293,7 @@ impl HardwareOptions {
 }
 
 impl RendererOptions {
-    /// Creates the backend.
+    /// Creates the backend that `--backend` and `--cpu-through` choose.
     pub fn backend(&self) -> anyhow::Result<Box<dyn Backend>> {
         let BackendOptions { backend, hardware } = &self.backend;
         match (self.cpu_through, backend) {
@@ -310,6 +314,7 @@ impl RendererOptions {
 
 /// Tells the choice of the backend: in the log of a program that has one, else on standard error.
 fn say(text: &str) -> io::Result<()> {
+    // A server logs in the format that was asked for; other commands have no subscriber.
     if tracing::dispatcher::has_been_set() {
         tracing::info!("{text}");
         return Ok(());
@@ -332,7 +337,7 @@ pub fn gib(text: &str) -> Result<f64, String> {
     }
 }
 
-/// GiB in bytes.
+/// Converts GiB to bytes, rounded down.
 pub fn bytes_of_gib(gib: f64) -> u64 {
     (gib * f64::from(1 << 30)) as u64
 }

@@ -38,11 +38,14 @@ fn open_browser(url: &str) {
     let opener = match env::consts::OS {
         "macos" => "open",
         "windows" => "explorer",
+        // Without a display xdg-open would start a browser of the terminal, over the output.
         _ if env::var_os("DISPLAY").is_none() && env::var_os("WAYLAND_DISPLAY").is_none() => return,
         _ => "xdg-open",
     };
     let mut command = Command::new(opener);
+    // Browsers write warnings to the terminal that started them.
     command.arg(url).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
+    // Only a note: the address was printed, and can be opened by hand.
     if let Err(error) = command.spawn() {
         tracing::debug!("{opener} did not start: {error}");
     }

@@ -36,6 +36,7 @@ impl Twins {
         let limit_bytes = u64::from(self.cache_gib) << 30;
         let default_dir = || Some(xdg_dir("XDG_CACHE_HOME", ".cache")?.join("wildcity"));
         let dir = self.cache_dir.clone().or_else(default_dir)?;
+        // A limit of 0 turns the cache off.
         (limit_bytes > 0).then_some(DiskCacheSettings { dir, limit_bytes })
     }
 
@@ -159,6 +160,7 @@ fn state_dir(given: Option<&PathBuf>, name: &str) -> anyhow::Result<PathBuf> {
 /// by hand, because that is shorter than using a crate.
 fn xdg_dir(variable: &str, below_home: &str) -> Option<PathBuf> {
     let set = |name| env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
+    // The XDG specification treats an empty variable as one that is not set.
     set(variable).or_else(|| set("HOME").map(|home| home.join(below_home)))
 }
 

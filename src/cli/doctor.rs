@@ -138,6 +138,7 @@ fn twins_found(twins: &Twins) -> Vec<Finding> {
         Ok(dir) => dir,
         Err(error) => return bad(exit::chain(&error)),
     };
+    // An object store has no disk here.
     let is_remote = dir.to_string_lossy().contains("://");
     let mut findings = if is_remote { Vec::new() } else { vec![disk("twins", &dir)] };
     let begun = std::time::Instant::now();
@@ -231,6 +232,7 @@ fn open_files() -> Finding {
 /// need it.
 fn clock() -> Finding {
     let built = std::env::current_exe().and_then(fs::metadata).and_then(|file| file.modified());
+    // The program cannot be from the future. A clock that is ahead cannot be noticed this way.
     let behind = built.ok().and_then(|built| built.duration_since(SystemTime::now()).ok());
     match behind.filter(|behind| behind.as_secs() > 60) {
         Some(behind) => {
@@ -260,6 +262,7 @@ fn readable_by_others(path: &Path) -> Option<Finding> {
     use std::os::unix::fs::MetadataExt as _;
     // A file that is not there is a finding of its own.
     let mode = fs::metadata(path).ok()?.mode();
+    // Any right of the group or of others.
     let is_open = mode & 0o077 != 0;
     let path = path.display();
     let text = format!(
@@ -278,6 +281,7 @@ fn readable_by_others(_: &Path) -> Option<Finding> {
 /// are most likely those of the same options.
 fn in_use(uploads: &Path) -> Option<Finding> {
     let lock = fs::File::open(uploads.join("lock")).ok()?;
+    // The lock is released when the file is closed, at the end of this function.
     let is_free = lock.try_lock().is_ok();
     let text = format!(
         "a server uses {} now: a second one with the same options takes no uploads; give it another --uploads and \

@@ -5,16 +5,14 @@ use std::process::ExitCode;
 /// An end of the program with an exit code of its own.
 #[derive(Debug)]
 pub struct Exit {
-    /// The exit code.
     pub code: u8,
-    /// What happened.
     pub message: String,
     /// Whether this is a result and not an error: a result is printed without `error:`.
     pub is_finding: bool,
 }
 
 impl Exit {
-    /// The program failed.
+    /// The program failed: the message is printed after `error:`.
     pub fn error(code: u8, message: String) -> Self {
         Self { code, message, is_finding: false }
     }
@@ -50,6 +48,7 @@ pub fn code(result: anyhow::Result<()>) -> ExitCode {
 /// twice: the `Display` text of many errors includes that of their source.
 pub fn chain(error: &anyhow::Error) -> String {
     error.chain().map(ToString::to_string).fold(String::new(), |text, cause| {
+        // Some errors repeat their cause in their own text.
         match (text.is_empty(), text.ends_with(&cause)) {
             (true, _) => cause,
             (false, true) => text,

@@ -186,6 +186,7 @@ impl Import {
             _ => SourceAxes::default(),
         };
         let changes = self.profile.load()?;
+        // Applied to the default only to find mistakes before a large file is read.
         changes.apply(RenderProfile::default())?;
         let expected = if self.axes.is_some() { &axes } else { &default_axes };
         let [expected_axes, _] = expected.options();
@@ -209,13 +210,13 @@ impl Import {
             ..ReadLimits::for_own_file()
         };
         let read = read_scene(&source, &axes, &default_axes, &limits, show);
-        let read = file_notes::explained(read).with_context(cannot)?;
-        let SourceScene { gaussians, hash, options, notes, .. } = read;
+        let SourceScene { gaussians, hash, options, notes, .. } =
+            file_notes::explained(read).with_context(cannot)?;
         bar.finish_and_clear();
         phases.end("read");
         file_notes::print(&source, &notes)?;
-        let profile = notes.profile().apply(RenderProfile::default())?;
-        let profile = changes.apply(profile)?;
+        let own_profile = notes.profile().apply(RenderProfile::default())?;
+        let profile = changes.apply(own_profile)?;
         let used_axes = options[0].trim_start_matches("axes=").to_owned();
         let used_scale = options[1].trim_start_matches("scale=").to_owned();
         let is_identity = used_axes == "identity" && !gaussians.is_empty();
@@ -225,6 +226,7 @@ impl Import {
                 "note: axes=identity; most captures need --axes y-down-z-forward, and glTF --axes '-1 0 0 0 0 1 0 1 0'"
             )?;
         }
+        // A file may say its own axes, which are known only now: then the sky is turned by those.
         let sky = if used_axes == expected_axes { sky } else { self.sky.read(&used_axes)? };
         if gaussians.is_empty() {
             let source = source.display();
@@ -249,7 +251,7 @@ impl Import {
             storage: StorageOptions { record: self.record, levels },
         };
         let mut show = progress::show(&bar);
-        let version = catalog.commit(new, &mut |done, total| {
+        let committed = catalog.commit(new, &mut |done, total| {
             show(done, total);
             match done {
                 0 => phases.end("sort"),
@@ -258,12 +260,13 @@ impl Import {
             }
         });
         // The file passed its checks, so a Gaussian that is refused now was changed by the options.
-        let version = version.map_err(|error| match error {
-            StoreError::Gaussians(error) => anyhow::Error::new(error)
-                .context(format!("after --axes {used_axes:?} --scale {used_scale}")),
-            error => error.into(),
-        });
-        let version = version.with_context(cannot)?;
+        let version = committed
+            .map_err(|error| match error {
+                StoreError::Gaussians(error) => anyhow::Error::new(error)
+                    .context(format!("after --axes {used_axes:?} --scale {used_scale}")),
+                error => error.into(),
+            })
+            .with_context(cannot)?;
         bar.finish_and_clear();
         // An alignment that cannot be read does not stay either. It is no error: the version is
         // published, and mends the twin.

@@ -39,8 +39,8 @@ pub(super) fn read_trajectory(path: &Path) -> anyhow::Result<Trajectory> {
 }
 
 fn read_json<T: DeserializeOwned>(path: &Path) -> anyhow::Result<T> {
-    let text = ingest::read_whole(path, limits::SETTINGS_FILE_BYTES);
-    let text = text.with_context(|| format!("{}", path.display()))?;
+    let text = ingest::read_whole(path, limits::SETTINGS_FILE_BYTES)
+        .with_context(|| format!("{}", path.display()))?;
     // serde reads a list as the fields of an object in their order, and then complains about their
     // number.
     if text.trim_ascii_start().first() == Some(&b'[') {

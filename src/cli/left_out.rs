@@ -32,6 +32,7 @@ pub(super) fn built_without(feature: &str) -> String {
 /// The error of a command that the parser does not know, if this build leaves it out.
 pub(super) fn command() -> Option<anyhow::Error> {
     let words: Vec<String> = env::args().skip(1).collect();
+    // clap does not know a command that is not built, and would suggest another one.
     let is_asked = |command: &str| {
         let asked: Vec<&str> = command.split(' ').collect();
         words.len() >= asked.len() && asked.iter().zip(&words).all(|(asked, word)| asked == word)

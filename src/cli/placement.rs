@@ -91,6 +91,7 @@ fn original_import(catalog: &Catalog, version: &Version) -> anyhow::Result<Impor
     };
     let mut number = version.number;
     let mut is_aligned = version.manifest.alignment()?.is_some();
+    // A parent is older: a log that says otherwise is damaged, and must not loop here.
     while let Some(parent) = parent_of(number).filter(|parent| *parent < number) {
         let before = catalog.version(twin, Some(parent)).with_context(|| {
             format!(
@@ -99,6 +100,7 @@ fn original_import(catalog: &Catalog, version: &Version) -> anyhow::Result<Impor
         })?;
         let was_aligned = before.manifest.alignment()?.is_some();
         anyhow::ensure!(
+            // The version has lost an alignment that its parent had: a push does not say it.
             is_aligned || !was_aligned,
             "version {number} was pushed, and does not say how version {parent} was aligned: {}",
             remedies(parent)
@@ -117,6 +119,7 @@ fn original_import(catalog: &Catalog, version: &Version) -> anyhow::Result<Impor
 impl Import {
     /// The transform from the axes of the capture to those of a twin that was aligned since.
     fn placed(&self, aligned: Option<Alignment>) -> anyhow::Result<Alignment> {
+        // The import comes first, and the alignment moves what it has made.
         let capture = imported(&self.axes, self.scale)?;
         Ok(aligned.map_or(capture, |aligned| aligned.after(&capture)))
     }
@@ -127,6 +130,7 @@ impl Import {
             let options = &provenance.options;
             let mut found: Vec<&str> =
                 options.iter().filter_map(|option| option.strip_prefix(key)).collect();
+            // Each push repeats the option: equal ones are one.
             found.dedup();
             match found[..] {
                 [] => Ok(default.to_owned()),
@@ -136,8 +140,8 @@ impl Import {
                 ),
             }
         };
-        let scale = one("scale=", "1")?;
-        let scale = scale.parse().with_context(|| format!("scale={scale}"))?;
+        let text = one("scale=", "1")?;
+        let scale = text.parse().with_context(|| format!("scale={text}"))?;
         Ok(Self { axes: one("axes=", "identity")?, scale })
     }
 }
@@ -165,11 +169,13 @@ mod tests {
 
     #[test]
     fn mirrors_and_different_files_are_refused() {
-        let mirrored = Import::from_provenance(&provenance(&["axes=y-up-z-forward"])).unwrap();
-        let mirrored = mirrored.placed(None).unwrap_err();
+        let mirrored = Import::from_provenance(&provenance(&["axes=y-up-z-forward"]))
+            .unwrap()
+            .placed(None)
+            .unwrap_err();
         assert!(mirrored.to_string().contains("mirror"), "{mirrored}");
-        let several = ["axes=identity", "scale=1", "axes=y-down-z-forward", "scale=1"];
-        let several = Import::from_provenance(&provenance(&several)).unwrap_err();
+        let options = ["axes=identity", "scale=1", "axes=y-down-z-forward", "scale=1"];
+        let several = Import::from_provenance(&provenance(&options)).unwrap_err();
         assert!(several.to_string().contains("--axes and --scale"), "{several}");
     }
 }

@@ -38,8 +38,7 @@ pub(super) struct LoadedProfile {
 impl ProfileOptions {
     /// Reads the file, if there is one.
     pub(super) fn load(&self) -> anyhow::Result<LoadedProfile> {
-        let from_file = self.profile.as_deref().map(read_profile).transpose()?;
-        let from_file = from_file.unwrap_or_default();
+        let from_file = self.profile.as_deref().map(read_profile).transpose()?.unwrap_or_default();
         Ok(LoadedProfile { from_file, settings: self.settings.clone() })
     }
 }
@@ -67,6 +66,7 @@ pub(super) fn read_profile(path: &Path) -> anyhow::Result<ProfileOverrides> {
     let cannot = || format!("--profile {text}");
     let json = ingest::read_whole(path, limits::PROFILE_FILE_BYTES).with_context(cannot)?;
     let changes: ProfileOverrides = serde_json::from_slice(&json).with_context(cannot)?;
+    // Applied to the default only to report a field out of range with the name of the file.
     changes.apply(RenderProfile::default()).with_context(cannot)?;
     Ok(changes)
 }

@@ -217,8 +217,10 @@ pub(super) async fn upload_all(
 /// Uploads a file, with a progress bar. Returns the id of the upload.
 async fn upload(client: &HttpClient, path: &Path) -> anyhow::Result<String> {
     let bar = progress::bytes("uploading");
-    let upload = client.upload(path, &mut progress::show(&bar)).await;
-    let upload = upload.with_context(|| format!("cannot upload {}", path.display()))?;
+    let upload = client
+        .upload(path, &mut progress::show(&bar))
+        .await
+        .with_context(|| format!("cannot upload {}", path.display()))?;
     bar.finish_and_clear();
     Ok(upload.id)
 }

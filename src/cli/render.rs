@@ -80,8 +80,11 @@ impl Render {
                 }
             };
             backend.render(&frame, &mut [target], &|_, _| {})?;
-            let file = self.format.encode(shot, &rgba, &rgb8).map_err(anyhow::Error::msg);
-            let file = file.with_context(|| format!("cannot write {}", path.display()))?;
+            let file = self
+                .format
+                .encode(shot, &rgba, &rgb8)
+                .map_err(anyhow::Error::msg)
+                .with_context(|| format!("cannot write {}", path.display()))?;
             output::write(&path, &file)?;
             bar.inc(1);
             writeln!(out, "{}", path.display())?;

@@ -74,8 +74,10 @@ impl SceneSource {
             cameras::read(&self.cameras).with_context(|| format!("{}", self.cameras.display()))?;
         let changes = self.profile.load()?;
         let (source, profile) = open_scene(&self.scene, &self.twins, self.bad)?;
-        let shots = listed.into_iter().map(|camera| shot(camera, profile, &changes));
-        let shots = shots.collect::<anyhow::Result<Vec<_>>>()?;
+        let shots = listed
+            .into_iter()
+            .map(|camera| shot(camera, profile, &changes))
+            .collect::<anyhow::Result<Vec<_>>>()?;
         Ok(LoadedScene { source, shots })
     }
 }
@@ -88,6 +90,7 @@ fn shot(
     changes: &LoadedProfile,
 ) -> anyhow::Result<Shot> {
     let ListedCamera { name, camera, world_from_camera, near, .. } = camera;
+    // The list overrides the scene, and the command line overrides both.
     profile.near = near.unwrap_or(profile.near);
     let profile = changes.apply(profile).with_context(|| format!("camera {name:?}"))?;
     Ok(Shot { name, view: View::new(camera, world_from_camera), profile })
@@ -107,9 +110,8 @@ pub(super) fn open_scene(
         let bar = progress::bytes("reading");
         let limits = ReadLimits { drop_bad, ..ReadLimits::for_own_file() };
         let read = ingest::read_limited(path, &limits, &mut progress::show(&bar));
-        let read = file_notes::explained(read);
         let ReadScene { gaussians, notes, .. } =
-            read.with_context(|| format!("{}", path.display()))?;
+            file_notes::explained(read).with_context(|| format!("{}", path.display()))?;
         bar.finish_and_clear();
         file_notes::print(path, &notes)?;
         let scene = Scene::from_gaussians(&gaussians);

@@ -37,8 +37,8 @@ impl SkySource {
     /// Reads the sky, if `--sky` gives one. `network_axes` are the default axes of a sky network.
     pub(super) fn read(&self, network_axes: &str) -> anyhow::Result<Option<SkyBytes>> {
         let Some(path) = &self.sky else { return Ok(None) };
-        let read = sky::read(path, self.sky_image);
-        let read = read.with_context(|| format!("{}", path.display()))?;
+        let read =
+            sky::read(path, self.sky_image).with_context(|| format!("{}", path.display()))?;
         let default_axes = match read.model {
             SkyModel::Network(..) => network_axes,
             SkyModel::Cube(_) => IMAGE_AXES,

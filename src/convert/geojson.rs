@@ -85,8 +85,10 @@ pub fn read(bytes: &[u8], origin: Option<[f64; 2]>) -> Result<MapFile, ConvertEr
             ConvertError::new(format!("features[{index}]"), format!("has no {field}; write one"))
         };
         let properties = feature["properties"].as_object().ok_or_else(|| missing("properties"))?;
-        let layer = properties.get("layer").and_then(Value::as_str);
-        let layer = layer.ok_or_else(|| missing("properties.layer"))?;
+        let layer = properties
+            .get("layer")
+            .and_then(Value::as_str)
+            .ok_or_else(|| missing("properties.layer"))?;
         let geometry = &feature["geometry"];
         let feature = Feature { index, layer, properties, geometry, origin: origin.as_ref() };
         feature.read(&mut map, &mut nuplan)?;
@@ -292,8 +294,10 @@ impl NuPlan {
                     format!("there is no {what} {fid}; add its feature"),
                 )
             };
-            let center = self.paths.get(&lane.fid);
-            let center = center.ok_or_else(|| missing("baseline path of lane", &lane.fid))?;
+            let center = self
+                .paths
+                .get(&lane.fid)
+                .ok_or_else(|| missing("baseline path of lane", &lane.fid))?;
             let edge = |fid: &String| {
                 let edge = self.boundaries.get(fid).ok_or_else(|| missing("boundary", fid))?;
                 Ok::<_, ConvertError>(along(center, edge.clone()))

@@ -25,7 +25,7 @@ pub enum What {
 pub struct Difference {
     pub step: u64,
     pub what: What,
-    /// How, in words.
+    /// The difference as a part of a sentence.
     pub how: String,
 }
 
@@ -186,7 +186,8 @@ fn command(a: &Frame, b: &Frame) -> Option<(What, String)> {
 
 fn ego(a: &Frame, b: &Frame) -> Option<(What, String)> {
     // `driven` returns only frames that have poses, so that `?` hides no difference.
-    let (pose_a, pose_b) = (a.poses.last()?, b.poses.last()?);
+    let pose_a = a.poses.last()?;
+    let pose_b = b.poses.last()?;
     if pose_a == pose_b {
         return None;
     }

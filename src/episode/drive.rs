@@ -120,7 +120,7 @@ pub(crate) fn ego_samples(poses: &[Pose], step_s: f64) -> Vec<EgoSample> {
         .collect()
 }
 
-/// Differences per second.
+/// Central differences per second, one-sided at both ends.
 fn slopes<T>(values: &[T], step_s: f64) -> Vec<T>
 where
     T: Copy + std::ops::Sub<Output = T> + std::ops::Div<f64, Output = T>,
@@ -182,10 +182,8 @@ fn tracks(scenario: &ScenarioLine, lines: &[ActorsLine], steps: &[u64]) -> Vec<T
         let Some(line) = of_step.get(step) else { continue };
         for state in line.actors.iter().filter_map(|state| state.state()) {
             let index = usize::from(state.index);
-            let (Some(track), Some(actor)) = (tracks.get_mut(index), scenario.actors.get(index))
-            else {
-                continue;
-            };
+            let found = tracks.get_mut(index).zip(scenario.actors.get(index));
+            let Some((track, actor)) = found else { continue };
             track.samples[k] = Some(TrackSample {
                 footprint: Body::new(&state.world_from_actor, &actor.actor_box(), 0.0).footprint,
                 velocity_mps: state.velocity_mps.truncate(),

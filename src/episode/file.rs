@@ -105,7 +105,7 @@ pub struct Cut {
     pub reason: String,
 }
 
-/// A recorded episode.
+/// A recorded episode, with every line of its file that can be read.
 #[derive(Clone, Debug, PartialEq)]
 pub struct EpisodeFile {
     pub header: Header,

@@ -59,7 +59,7 @@ pub struct ScenarioLine {
     pub checks_static: bool,
 }
 
-/// The ego's box.
+/// The box of the ego, and where it is relative to the rear axle.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct EgoLine {
     /// Length, width and height, in metres.
@@ -101,7 +101,7 @@ fn is_vertical(up: &[f64; 3]) -> bool {
     *up == vertical()
 }
 
-/// A lane.
+/// A lane or an area of the map, seen from above.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct LaneLine {
     /// Its outline, in metres, without repeating the first point.
@@ -121,7 +121,6 @@ pub struct LaneLine {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ActorsLine {
     pub step: u64,
-    /// Time, in microseconds.
     pub time_us: i64,
     /// The actors that are present, by rising index.
     pub actors: Vec<ActorStateLine>,
@@ -204,7 +203,7 @@ pub struct ContactEvent {
     pub actor_velocity: [f64; 2],
 }
 
-/// [`CollisionType`] in JSON.
+/// The kind of a contact, [`CollisionType`] in JSON.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[expect(missing_docs, reason = "the names are those of CollisionType")]
@@ -234,7 +233,6 @@ pub struct EpisodeResult {
 pub struct FaultLine {
     /// Its name, as `contact.at_fault`.
     pub fault: String,
-    /// When, in microseconds.
     pub time_us: i64,
     /// Name of the actor, for a contact with one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -445,7 +443,7 @@ impl ActorLine {
         Self { name: spec.name.clone(), class: spec.class, size, asset: spec.asset.clone() }
     }
 
-    /// Its box.
+    /// Length, width and height of its box, in metres.
     pub fn actor_box(&self) -> ActorBox {
         let [length_m, width_m, height_m] = self.size;
         ActorBox { length_m, width_m, height_m }

@@ -26,7 +26,6 @@ pub struct Overview {
     pub head: RecordHead,
     /// Name of the scenario, if there was one.
     pub scenario: Option<String>,
-    /// Steps done.
     pub steps: u64,
     /// Simulated time, in microseconds.
     pub time_us: i64,

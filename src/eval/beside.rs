@@ -86,15 +86,18 @@ impl Beside<'_> {
     /// those that the repair of the views searches: from 8 m behind a view to 2 m ahead of it.
     async fn record_images(&self) -> anyhow::Result<()> {
         let Self { url, catalog, truth, spoiled, drive, .. } = *self;
+        // A twin of an earlier run has the images already.
         let base = catalog.version(spoiled, None)?;
         if base.manifest.views.is_some() {
             return Ok(());
         }
         let rig = base.manifest.rig.as_ref().context("the demo twin has a rig")?;
+        // From 10 m behind to 4 m ahead: at each side one image more than the repair searches.
         let around = |view_m: f64| (-5..=2).map(move |k| view_m + RECORDED_M * f64::from(k));
         let stations_m: Vec<f64> = STATIONS_M.into_iter().flat_map(around).collect();
         let mut commit = catalog.begin(spoiled, CommitKind::Import, StorageOptions::default())?;
         let mut views = Vec::new();
+        // Few poses at a time: one answer has the images of all of them.
         for some_m in stations_m.chunks(8) {
             let poses: Vec<geometry::Pose> =
                 some_m.iter().map(|at_m| drive.at_station(*at_m)).collect();
@@ -102,10 +105,14 @@ impl Beside<'_> {
             let drawn = drawn(url, truth, None, &wire_poses).await?;
             for ((station_m, world_from_rig), images) in some_m.iter().zip(&poses).zip(drawn) {
                 for (name, image) in CAMERAS.iter().zip(images) {
-                    let mounted = rig.cameras.iter().find(|camera| camera.name == *name);
-                    let mounted = mounted.context("the demo rig has the camera")?;
+                    let mounted = rig
+                        .cameras
+                        .iter()
+                        .find(|camera| camera.name == *name)
+                        .context("the demo rig has the camera")?;
                     let [width, height] = SIZE_PX;
                     let mut camera = mounted.camera.scaled(width.into(), height.into())?;
+                    // The recorded image is drawn at this size: nothing has shrunk it.
                     camera.native_size_px = None;
                     let file = wildcity_session::jpeg(&image, width, height, JPEG_QUALITY);
                     views.push(RecordedView {

@@ -203,7 +203,7 @@ impl Boxes {
         self
     }
 
-    /// Number of tracks.
+    /// Number of tracks with at least one box.
     pub fn tracks(&self) -> usize {
         self.tracks.len()
     }

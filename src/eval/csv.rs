@@ -4,7 +4,6 @@ use super::evaluated_image::EvaluatedImage;
 use super::evaluation::Evaluation;
 use super::scores::Scores;
 
-/// The columns.
 const HEADER: &str = "name,camera,width,height,counted,covered,psnr_db,ssim,ssim_mirrored,flip,aligned_psnr_db,\
                       aligned_ssim,lpips,repaired_psnr_db,repaired_ssim,repaired_ssim_mirrored,repaired_flip,\
                       repaired_aligned_psnr_db,repaired_aligned_ssim,repaired_lpips,moving,lidar_points,lidar_mean_m,\

@@ -10,7 +10,6 @@ use super::kid::KidScores;
 use super::means::{CameraMeans, Means};
 use wildcity_scene::RenderProfile;
 
-/// Format of eval.json.
 const FORMAT: &str = "wildcity.eval/1";
 
 /// What each number means, by its name in eval.json.

@@ -7,7 +7,7 @@ use super::mean::mean;
 use super::reprojection::Reprojection;
 use wildcity_render::compare::json_numbers::serialize_number;
 
-/// One off-trajectory view.
+/// Scores of one view off the trajectory.
 #[derive(Clone, Debug, Serialize)]
 pub struct ExtrapolatedView {
     /// Name of the real image that it was moved from.

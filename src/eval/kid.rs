@@ -187,7 +187,8 @@ mod tests {
 
     #[test]
     fn two_images_of_one_number_are_as_the_formula_says() {
-        let [a, b] = [vec![vec![1.0], vec![2.0]], vec![vec![0.0], vec![-1.0]]];
+        let a = vec![vec![1.0], vec![2.0]];
+        let b = vec![vec![0.0], vec![-1.0]];
         // (1 * 2 + 1)^3 + (0 + 1)^3 - 2 / 4 of (1, 0, 1, -1).
         let between = (1.0 + 0.0 + 1.0 - 1.0) / 2.0;
         let kid = Kid::compare(&a, &b).unwrap();
@@ -197,7 +198,9 @@ mod tests {
 
     #[test]
     fn other_images_are_farther_away_and_subsets_agree_with_all() {
-        let [a, b, far] = [set(60, 16, 0.0), set(50, 16, 0.01), set(50, 16, 0.5)];
+        let a = set(60, 16, 0.0);
+        let b = set(50, 16, 0.01);
+        let far = set(50, 16, 0.5);
         let near_kid = Kid::compare(&a, &b).unwrap();
         let far_kid = Kid::compare(&a, &far).unwrap();
         assert!(far_kid.mean > near_kid.mean + 0.1, "{near_kid:?} {far_kid:?}");

@@ -82,7 +82,7 @@ pub enum LidarError {
 pub struct WorldPoints {
     /// Positions in metres, in order of time.
     pub points_m: Vec<DVec3>,
-    /// Times in microseconds.
+    /// Times in microseconds, not decreasing.
     pub time_us: Vec<i64>,
     /// Points that were left out, because no two poses at most 0.2 s apart enclose their time.
     pub skipped: usize,
@@ -130,7 +130,7 @@ pub struct LidarBin {
     pub mean_m: f64,
 }
 
-/// Means over images.
+/// Means over the images that LiDAR points were compared with.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct LidarMeans {
     /// Number of images with points.
@@ -157,8 +157,8 @@ impl LidarPoints {
     pub fn parse(bytes: &[u8]) -> Result<Self, LidarError> {
         let file = SafeTensors::deserialize(bytes)
             .map_err(|error: SafeTensorError| LidarError::File(error.to_string()))?;
-        let points = floats(&file, "points_m", &[None, Some(3)])?;
-        let points = points.ok_or(LidarError::Missing("points_m"))?;
+        let points =
+            floats(&file, "points_m", &[None, Some(3)])?.ok_or(LidarError::Missing("points_m"))?;
         let times = times(&file, "time_us")?.ok_or(LidarError::Missing("time_us"))?;
         if times.len() != points.len() / 3 {
             return Err(LidarError::Tensor {
@@ -192,7 +192,7 @@ impl LidarPoints {
         Self { points_m, time_us, rig_from_lidar: Pose::IDENTITY, poses: Some(poses) }
     }
 
-    /// Number of points.
+    /// Number of points, of all times.
     pub fn len(&self) -> usize {
         self.points_m.len()
     }
@@ -221,8 +221,11 @@ impl LidarPoints {
         };
         let own = self.poses.as_ref().map(aligned);
         // The poses of the file come first: they are in the clock of its points.
-        let poses = own.as_deref().or(drive).filter(|poses| !poses.is_empty());
-        let poses = poses.ok_or(LidarError::NoPoses)?;
+        let poses = own
+            .as_deref()
+            .or(drive)
+            .filter(|poses| !poses.is_empty())
+            .ok_or(LidarError::NoPoses)?;
         let mut world = WorldPoints { points_m: Vec::new(), time_us: Vec::new(), skipped: 0 };
         for (time_us, point_m) in self.time_us.iter().zip(&self.points_m) {
             match pose_at(poses, *time_us) {
@@ -255,7 +258,8 @@ fn pose_at(poses: &[Keyframe], time_us: i64) -> Option<Pose> {
         return None;
     }
     let share = (time_us - before.time_us) as f64 / gap_us as f64;
-    let [a, b] = [before.world_from_rig, next.world_from_rig];
+    let a = before.world_from_rig;
+    let b = next.world_from_rig;
     let rotation = slerp(a.rotation, b.rotation, share);
     Some(Pose { position_m: a.position_m.lerp(b.position_m, share), rotation })
 }
@@ -263,7 +267,8 @@ fn pose_at(poses: &[Keyframe], time_us: i64) -> Option<Pose> {
 /// The rotation at a share of the shorter arc between two, by the angle itself also where it is
 /// small (Shoemake 1985).
 fn slerp(a: DQuat, b: DQuat, share: f64) -> DQuat {
-    let [a, mut b] = [DVec4::from(a), DVec4::from(b)];
+    let a = DVec4::from(a);
+    let mut b = DVec4::from(b);
     // q and -q are one rotation: the nearer of both gives the shorter arc.
     if a.dot(b) < 0.0 {
         b = -b;
@@ -303,7 +308,8 @@ impl LidarDepth {
             }
         }
         let bin = |at: usize| {
-            let [from_m, to_m] = [BINS_M[at], BINS_M[at + 1]];
+            let from_m = BINS_M[at];
+            let to_m = BINS_M[at + 1];
             // Bins are half-open: a point counts in one of them.
             let within = errors.iter().filter(|(depth_m, _)| (from_m..to_m).contains(depth_m));
             let points = within.clone().count();
@@ -333,7 +339,8 @@ impl LidarMeans {
             let with_points = of.iter().filter(|bin| bin.points > 0);
             // Weighted by points, because bins are of the points of all images together.
             let sum_m: f64 = with_points.map(|bin| bin.points as f64 * bin.mean_m).sum();
-            let [from_m, to_m] = [BINS_M[at], BINS_M[at + 1]];
+            let from_m = BINS_M[at];
+            let to_m = BINS_M[at + 1];
             LidarBin { from_m, to_m, points, mean_m: sum_m / points as f64 }
         };
         Some(Self {
@@ -408,8 +415,8 @@ fn poses(file: &SafeTensors<'_>) -> Result<Option<Vec<Keyframe>>, LidarError> {
     let Some(times) = times(file, "pose_time_us")? else { return Ok(None) };
     let shape = [Some(times.len()), Some(4), Some(4)];
     // The shape ties the number of matrices to that of times.
-    let matrices = floats(file, "world_from_rig", &shape)?;
-    let matrices = matrices.ok_or(LidarError::Missing("world_from_rig"))?;
+    let matrices =
+        floats(file, "world_from_rig", &shape)?.ok_or(LidarError::Missing("world_from_rig"))?;
     if let Some(at) = times.windows(2).position(|pair| pair[1] <= pair[0]) {
         return Err(LidarError::Time(at + 1));
     }

@@ -27,7 +27,7 @@ pub struct Means {
     pub lidar: Option<LidarMeans>,
 }
 
-/// Means of scores.
+/// Means of the scores over all images.
 #[derive(Clone, Debug, Serialize)]
 pub struct ScoreMeans {
     /// Mean PSNR, in dB.
@@ -36,10 +36,8 @@ pub struct ScoreMeans {
     /// PSNR of the pixels of all images together, in dB.
     #[serde(serialize_with = "serialize_number")]
     pub pooled_psnr_db: f64,
-    /// Mean of [`Scores::ssim`].
     #[serde(serialize_with = "serialize_number")]
     pub ssim: f64,
-    /// Mean of [`Scores::ssim_mirrored`].
     #[serde(serialize_with = "serialize_number")]
     pub ssim_mirrored: f64,
     #[serde(serialize_with = "serialize_number")]
@@ -58,7 +56,6 @@ pub struct AlignedMeans {
     /// Mean PSNR, in dB.
     #[serde(serialize_with = "serialize_number")]
     pub psnr_db: f64,
-    /// Mean of [`Scores::ssim`].
     #[serde(serialize_with = "serialize_number")]
     pub ssim: f64,
 }
@@ -70,7 +67,6 @@ pub struct Gain {
     /// Change of PSNR, in dB.
     #[serde(serialize_with = "serialize_number")]
     pub psnr_db: f64,
-    /// Change of [`Scores::ssim`].
     #[serde(serialize_with = "serialize_number")]
     pub ssim: f64,
     #[serde(serialize_with = "serialize_number")]

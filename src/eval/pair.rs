@@ -19,9 +19,7 @@ pub enum PairError {
         what: &'static str,
         /// Its number of values.
         values: usize,
-        /// Width, in pixels.
         width: u32,
-        /// Height, in pixels.
         height: u32,
         /// The number that it should have.
         expected: usize,
@@ -63,12 +61,12 @@ impl Pair {
         self.size_px
     }
 
-    /// The real image.
+    /// The real image, `[height, width, 3]`.
     pub fn truth(&self) -> &[u8] {
         &self.truth
     }
 
-    /// The rendered image.
+    /// The rendered image, `[height, width, 3]`.
     pub fn rendered(&self) -> &[u8] {
         &self.rendered
     }

@@ -38,10 +38,8 @@ pub struct Scores {
 /// Scores after the best change of exposure.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct AlignedScores {
-    /// As [`Scores::psnr_db`].
     #[serde(serialize_with = "serialize_number")]
     pub psnr_db: f64,
-    /// As [`Scores::ssim`].
     #[serde(serialize_with = "serialize_number")]
     pub ssim: f64,
     pub exposure: Exposure,

@@ -32,6 +32,7 @@ pub fn colored_points(
 ) -> Result<Vec<ColoredPoint>, LogError> {
     let tracks = Tracks::read(log, [i64::MIN, i64::MAX])?;
     let reader = SampleReader::choose(log, images_per_camera)?;
+    // A fixed seed: the same log gives the same points.
     let mut random = Random::new(0, "points", 0);
     let mut points: Vec<ColoredPoint> = Vec::new();
     let mut seen = 0;
@@ -43,6 +44,8 @@ pub fn colored_points(
         for point in reader.points(sample, poses)? {
             let shown = projection.project(point.world_m);
             let Some((at_px, _)) = shown else { continue };
+            // Moving objects would leave a trail of points, which a training would take for the
+            // scene.
             if near.hides(point.world_m, point.time_us) {
                 continue;
             }

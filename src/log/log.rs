@@ -58,6 +58,7 @@ impl Log {
 
     /// A file that a row names.
     pub fn path(&self, file: &str) -> PathBuf {
+        // `join` returns an absolute path as it is.
         self.folder.join(file)
     }
 
@@ -231,6 +232,7 @@ pub(crate) fn read_whole(path: &Path, limit: u64) -> Result<Vec<u8>, LogError> {
         return Err(LogError::malformed(path, "it is not a file"));
     }
     let mut bytes = Vec::new();
+    // Not the length that the system states: the file may grow while it is read.
     let read = file.take(limit + 1).read_to_end(&mut bytes);
     read.map_err(|error| LogError::file(path, &error))?;
     if bytes.len() as u64 > limit {

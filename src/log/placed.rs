@@ -43,8 +43,12 @@ impl Log {
     fn place(&self, poses: &Poses, row: ImageRow) -> Result<Option<PlacedImage>, LogError> {
         let mounted = &self.rig.cameras[self.camera_index(&row.camera)?];
         let half_us = mounted.shutter.map_or(0, |shutter| shutter.duration_us / 2);
+        // The time of a row is that of its last line of pixels. Its middle line gives the pose that
+        // is least wrong for the whole image.
         let middle_us = row.time_us.saturating_sub(half_us);
         let placed = poses.at(middle_us).map(|world_from_rig| PlacedImage {
+            // Twelve digits are 11 days of microseconds; shorter numbers get zeros, so that names
+            // sort by time.
             name: format!("{0}/{0}_{1:012}", row.camera, row.time_us),
             file: self.path(&row.file),
             camera: mounted.camera,

@@ -46,6 +46,8 @@ impl SweepPoints {
         }
         let tensors = Tensors { file, path };
         let points = tensors.needed(0, None)?;
+        // A point is three F32. The shape `[n, 3]` was checked, so that the division has no
+        // remainder.
         let count = points.len() / 12;
         let sweep = Self {
             points_m: points.chunks_exact(12).map(point).collect(),
@@ -54,6 +56,7 @@ impl SweepPoints {
             ring: tensors.found(3, Some(count))?.map(|b| values(b, u16::from_le_bytes)),
         };
         if !sweep.time_us.is_sorted() {
+            // Neighbours in time are neighbours in angle: edges are looked for between them.
             return Err(tensors.refused(1, "decreases; sort the points by time".to_owned()));
         }
         Ok(sweep)
@@ -70,6 +73,7 @@ impl SweepPoints {
         let intensity =
             self.intensity.as_ref().map(|all| bytes(all, |value: &f32| value.to_le_bytes()));
         let ring = self.ring.as_ref().map(|all| bytes(all, |value: &u16| value.to_le_bytes()));
+        // In the order of `TENSORS`, with which they are paired below.
         let all = [Some(points), Some(times), intensity, ring];
         let mut views = Vec::new();
         for ((name, dtype), data) in TENSORS.into_iter().zip(&all) {
@@ -117,7 +121,9 @@ impl Tensors<'_> {
     /// The bytes of a tensor, by its place in [`TENSORS`], if the file has it.
     fn found(&self, index: usize, count: Option<usize>) -> Result<Option<&[u8]>, LogError> {
         let (name, dtype) = TENSORS[index];
+        // The only error is that no tensor has this name: the file as a whole has been checked.
         let Ok(tensor) = self.file.tensor(name) else { return Ok(None) };
+        // Without a count it is the positions that are read: their number sets that of all others.
         let is_shape = match (tensor.shape(), count) {
             ([_, 3], None) => true,
             ([found], Some(count)) => *found == count,

@@ -45,6 +45,7 @@ impl Poses {
         if gap_us > LARGEST_GAP_US.unsigned_abs() {
             return None;
         }
+        // Times of poses strictly increase, so the gap is not 0.
         let share = time_us.abs_diff(before.time_us) as f64 / gap_us as f64;
         Some(before.world_from_rig.interpolate(&next.world_from_rig, share))
     }
@@ -98,11 +99,13 @@ impl<'a> Stations<'a> {
 
     /// The distance from the start at a time, in metres; `None` where there is no pose.
     pub fn at(&self, time_us: i64) -> Option<f64> {
+        // Within a gap of the poses the path is unknown, and with it the distance.
         self.poses.at(time_us)?;
         let keys = &self.poses.keyframes;
         let after = keys.partition_point(|key| key.time_us <= time_us);
         let before = after.checked_sub(1)?;
         let from_m = self.stations_m[before];
+        // After the last pose `at` has returned: the time is exactly that of the last one.
         let Some(to_m) = self.stations_m.get(after) else { return Some(from_m) };
         let since_us = |until_us: i64| until_us.abs_diff(keys[before].time_us) as f64;
         let share = since_us(time_us) / since_us(keys[after].time_us);

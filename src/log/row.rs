@@ -216,6 +216,7 @@ impl Row for TrackRow {
         if self.track.is_empty() {
             return Err(FieldError::new("track", "an id has at least one character"));
         }
+        // NaN compares as false with both bounds, and so is refused, too.
         let is_side = |side: &f64| *side > 0.0 && *side <= limits::BOX_M;
         if let Some(side) = self.size.iter().find(|side| !is_side(side)) {
             let reason = format!("{side:?}; a side is more than 0 and at most {} m", limits::BOX_M);
@@ -271,6 +272,7 @@ fn check_finite(field: &str, values: &[f64]) -> Result<(), FieldError> {
 }
 
 fn check_angle(field: &str, degrees: f64, most: f64) -> Result<(), FieldError> {
+    // NaN is not at most anything, so it is refused with the numbers beyond the range.
     if degrees.abs() <= most {
         return Ok(());
     }

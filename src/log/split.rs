@@ -108,6 +108,7 @@ fn write(log: &Log, out: &Path, settings: &SplitSettings) -> Result<Split, LogEr
     let stations = Stations::new(&poses);
     let mut splitter = Splitter::new(log, &poses, &stations, settings)?;
     let drives = write_drives(log, &poses, out, settings)?;
+    // One more than fit: the last one has the rest of the drive, and the rows after the last pose.
     let count = (stations.length_m() / settings.chunk_m).floor() as usize + 1;
     let mut chunks = Vec::new();
     for number in 0..count {
@@ -141,7 +142,10 @@ type Table<R> = Option<Peekable<Rows<R>>>;
 fn next_before<R: Row>(table: &mut Table<R>, until_us: i64) -> Result<Option<R>, LogError> {
     let Some(rows) = table else { return Ok(None) };
     let is_next = |row: &Result<R, LogError>| match row {
+        // Rows are in order of time, so the first that is too late ends the chunk and begins the
+        // next.
         Ok(row) => row.time_us() < until_us,
+        // An error is taken out, so that it is reported instead of ending the table quietly.
         Err(_) => true,
     };
     rows.next_if(is_next).transpose()
@@ -202,6 +206,8 @@ impl<'a> Splitter<'a> {
     fn write_poses(&self, [from, until]: [i64; 2], out: &mut LogWriter) -> Result<(), LogError> {
         let from_us = from.saturating_sub(LARGEST_GAP_US);
         let until_us = until.saturating_add(LARGEST_GAP_US);
+        // The poses are in memory, so that chunks may overlap here: other tables are read only
+        // once.
         let keys = self.poses.keyframes();
         let begin = keys.partition_point(|key| key.time_us < from_us);
         let end = keys.partition_point(|key| key.time_us < until_us);
@@ -226,6 +232,7 @@ impl<'a> Splitter<'a> {
         // In spite of rounding, an image at exactly this distance is of the next keyframe.
         let number = (station_m / self.settings.keyframe_m + 1e-3).floor() as u64;
         let (last, count) = &mut self.keyframes[camera];
+        // `None` is less than every number: the first image of a camera is always kept.
         if *last >= Some(number) {
             return Ok(None);
         }

@@ -24,7 +24,6 @@ pub struct Rows<R> {
 }
 
 impl<R: Row> Rows<R> {
-    /// Opens a table.
     pub(crate) fn open(path: &Path) -> Result<Self, LogError> {
         let file = File::open(path).map_err(|error| LogError::file(path, &error))?;
         Ok(Self {
@@ -42,6 +41,7 @@ impl<R: Row> Rows<R> {
     fn read_line(&mut self) -> Result<bool, LogError> {
         self.text.clear();
         self.line += 1;
+        // One byte more than a row may have tells a line that is too long from one that just fits.
         let mut limited = (&mut self.lines).take(limits::LINE_BYTES + 1);
         let read = limited.read_until(b'\n', &mut self.text);
         read.map_err(|error| LogError::file(&self.path, &error))?;
@@ -79,6 +79,7 @@ impl<R: Row> Iterator for Rows<R> {
             return None;
         }
         let row = self.next_row().transpose();
+        // After a line that is too long, the next read would begin in the middle of it.
         self.is_done = !matches!(row, Some(Ok(_)));
         row
     }
@@ -131,6 +132,8 @@ impl Order {
             );
             return Err(FieldError::new("time_us", reason));
         }
+        // Rows of different cameras may have one time; two of one camera would be the same image
+        // twice.
         let before_us = match row.key() {
             None => self.last_us,
             Some(key) => self.last_key_us(key, time_us),

@@ -83,8 +83,11 @@ impl Tracks {
     /// The tracks that have a row near a time: few of a long log.
     pub fn near(&self, time_us: i64) -> NearTracks<'_> {
         let is_near = |rows: &&[TrackRow]| {
+            // A list is made with its first row, so it is never empty.
             let from_us = rows[0].time_us;
             let to_us = rows[rows.len() - 1].time_us;
+            // A point may be seen half a second from the image, and its box be known half a second
+            // from that.
             let reach_us = 2 * NEAR_US;
             time_us >= from_us.saturating_sub(reach_us) && time_us <= to_us.saturating_add(reach_us)
         };
@@ -104,6 +107,7 @@ impl NearTracks<'_> {
     pub fn hides(&self, point_m: DVec3, time_us: i64) -> bool {
         self.rows.iter().any(|rows| {
             let after = rows.partition_point(|row| row.time_us <= time_us);
+            // The row before or at the time, and the one after it; either may not exist.
             let around = [after.checked_sub(1), Some(after)].into_iter().flatten();
             let known = around.filter(|at| *at < rows.len());
             let near = known.min_by_key(|at| rows[*at].time_us.abs_diff(time_us));
@@ -121,6 +125,8 @@ fn is_hidden(rows: &[TrackRow], at: usize, point_m: DVec3, time_us: i64) -> bool
         return false;
     }
     let moved_m = since_us as f64 / 1e6 * velocity;
+    // The point is moved back instead of the box forward; the turn of the box since its row is left
+    // out, because half a second turns it little.
     let box_m = row.world_from_box.inverse().transform_point(point_m - moved_m);
     let half_m = 0.5 * DVec3::from_array(row.size) + GROWN_M;
     box_m.abs().cmple(half_m).all()
@@ -135,13 +141,17 @@ fn velocity(rows: &[TrackRow], at: usize) -> DVec3 {
     }
     let time_us = rows[at].time_us;
     let off_us = |row: &TrackRow| row.time_us.abs_diff(time_us);
+    // Before the row, distances in time fall along the list, and behind it they rise: both ends of
+    // the window can be found by bisection.
     let mut first = rows[..at].partition_point(|row| off_us(row) > NEAR_US as u64);
     let mut after = at + rows[at..].partition_point(|row| off_us(row) <= NEAR_US as u64);
+    // Only the row itself is near, as in labels at 1 Hz.
     if after == first + 1 {
         let is_near = |at: usize| rows.get(at).is_some_and(|row| off_us(row) <= 2 * NEAR_US as u64);
         first -= usize::from(at > 0 && is_near(at - 1));
         after += usize::from(is_near(at + 1));
     }
+    // A track of one row does not tell a speed, and counts as standing still.
     let [first, .., last] = &rows[first..after] else { return DVec3::ZERO };
     let moved_m = last.world_from_box.position_m - first.world_from_box.position_m;
     moved_m / (last.time_us.abs_diff(first.time_us) as f64 / 1e6)
@@ -150,6 +160,8 @@ fn velocity(rows: &[TrackRow], at: usize) -> DVec3 {
 /// A pose of a scenario's actor: its origin is on the ground under the box's middle.
 fn keyframe(row: &TrackRow) -> KeyframeSection {
     let below = Pose { position_m: -0.5 * row.size[2] * DVec3::Z, ..Pose::IDENTITY };
+    // Half the height down along the axes of the box, not of the world: on a slope the ground is
+    // there.
     let placed = row.world_from_box * below;
     let pose =
         PoseSection { xyz: placed.position_m.to_array(), yaw_rad: None, q: Some(placed.q_wxyz()) };

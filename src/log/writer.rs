@@ -65,6 +65,7 @@ impl LogWriter {
     /// # Errors
     /// The row cannot be used or is out of order, or the file cannot be written.
     pub fn add<R: Row>(&mut self, row: &R) -> Result<(), LogError> {
+        // Not `entry().or_insert_with()`: making the file can fail.
         if !self.tables.contains_key(R::FILE) {
             self.tables.insert(R::FILE, Table::create(&self.partial.join(R::FILE))?);
         }
@@ -106,6 +107,8 @@ impl LogWriter {
         if self.out.exists() {
             return Err(LogError::Exists { path: self.out.clone() });
         }
+        // The rename is the last step: a process that ends before it leaves no folder that looks
+        // complete.
         let renamed = fs::rename(&self.partial, &self.out);
         renamed.map_err(|error| LogError::file(&self.out, &error))?;
         self.is_finished = true;

@@ -67,7 +67,8 @@ impl Probe {
             let middle = |side: usize| {
                 (side / 2 / self.multiple_of * self.multiple_of + phase).min(side - 1)
             };
-            let [y, x] = [middle(height), middle(width)];
+            let y = middle(height);
+            let x = middle(width);
             let mut inputs = self.images(height, width);
             for planes in &mut inputs {
                 // All inputs at once: the halo is that of the output on any of them.

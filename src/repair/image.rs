@@ -33,13 +33,13 @@ pub struct View<'a> {
     pub reference_valid: Option<&'a [f32]>,
     /// Distance along the camera's axis in metres; 0 or less means none.
     pub depth_m: Option<&'a [f32]>,
-    /// 0 to 1.
+    /// Accumulated opacity, from 0 to 1.
     pub opacity: Option<&'a [f32]>,
     /// Unit vectors in the camera's axes: all x, all y, all z.
     pub normals: Option<&'a [f32]>,
     /// 1 within the field of the lens, 0 outside. The repaired image is black outside.
     pub mask: Option<&'a [f32]>,
-    /// 0 to 1.
+    /// Trust of the whole image, from 0 to 1.
     pub trust: Option<f32>,
 }
 

@@ -12,13 +12,13 @@ pub const MAX_FILES: usize = 16;
 pub const MAX_INPUTS: usize = 16;
 /// Width or height of an image, in pixels.
 pub const MAX_SIDE_PX: usize = 16_384;
-/// `size.multiple_of`, in pixels.
+/// Largest `size.multiple_of` of a manifest, in pixels.
 pub const MAX_MULTIPLE_PX: u32 = 256;
-/// `outputs[0].scale`.
+/// Largest `outputs[0].scale` of a manifest.
 pub const MAX_SCALE: u32 = 4;
 /// Values of a constant input: a prompt of 77 x 1024 and some room.
 pub const MAX_CONSTANT_VALUES: usize = 1 << 20;
-/// `timeout_ms`: ten minutes.
+/// Largest `timeout_ms` of a manifest: ten minutes.
 pub const MAX_TIMEOUT_MS: u64 = 600_000;
 /// Threads of the cpu provider.
 pub const MAX_THREADS: usize = 64;

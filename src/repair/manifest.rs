@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Manifest {
-    /// [`Manifest::FORMAT`].
+    /// The format, which must be [`Manifest::FORMAT`].
     pub format: String,
     /// The name that sessions ask for.
     pub name: String,
@@ -52,7 +52,7 @@ pub struct ModelFile {
     pub blake3: String,
 }
 
-/// Execution providers.
+/// Execution providers of ONNX Runtime.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Provider {
@@ -155,7 +155,7 @@ fn default_range() -> [f32; 2] {
     [0.0, 1.0]
 }
 
-/// Meanings of inputs.
+/// What an input of the graph means.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum InputRole {
@@ -169,15 +169,15 @@ pub enum InputRole {
     ReferenceWarped,
     /// 1 where `reference_warped` has a value, else 0, 1 channel.
     ReferenceValid,
-    /// 1 channel, metres.
+    /// Distance along the camera's axis, 1 channel, in the unit of the input.
     Depth,
-    /// 1 channel.
+    /// Accumulated opacity from 0 to 1, 1 channel.
     Opacity,
-    /// 3 channels.
+    /// Unit vectors in the camera's axes, 3 channels.
     Normals,
     /// Field of the lens, 1 channel.
     Mask,
-    /// Shape \[batch, 1\].
+    /// Trust of the whole image, of shape \[batch, 1\].
     Trust,
     /// One value everywhere, such as a time step.
     Constant,
@@ -217,7 +217,7 @@ impl InputRole {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Dtype {
-    /// 32 bits.
+    /// 32 bits (IEEE single).
     #[default]
     F32,
     /// 16 bits (IEEE half).
@@ -226,7 +226,7 @@ pub enum Dtype {
     I64,
 }
 
-/// Unit of `depth`.
+/// Unit of the input `depth`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Unit {
@@ -256,7 +256,7 @@ fn default_scale() -> u32 {
     1
 }
 
-/// Meanings of outputs.
+/// What the output of the graph means.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum OutputRole {
@@ -283,7 +283,7 @@ impl Size {
 }
 
 impl Manifest {
-    /// The field `format`.
+    /// Value of the field `format` of a manifest.
     pub const FORMAT: &str = "wildcity.repair/1";
 
     /// The input of the image itself.
@@ -293,7 +293,6 @@ impl Manifest {
         self.inputs.iter().find(is_image).unwrap_or(&self.inputs[0])
     }
 
-    /// The output.
     pub(crate) fn output(&self) -> &Output {
         &self.outputs[0]
     }

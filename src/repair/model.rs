@@ -56,7 +56,7 @@ impl LoadOptions {
     }
 }
 
-/// A repaired image.
+/// A repaired image and the hashes that a record has of it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Repaired {
     /// `scale` times as large as the rendered image.
@@ -139,12 +139,12 @@ impl Model {
         Ok(Model { runner, provider, repair_hash: hasher.finalize(), halo, is_deterministic })
     }
 
-    /// The manifest.
+    /// The manifest that the model was loaded from.
     pub fn manifest(&self) -> &Manifest {
         &self.runner.manifest
     }
 
-    /// The execution provider.
+    /// The execution provider that runs the graph.
     pub fn provider(&self) -> Provider {
         self.provider
     }

@@ -59,7 +59,7 @@ impl Models {
         Ok(Models { options, entries, references })
     }
 
-    /// The names, sorted.
+    /// The names of the models, sorted.
     pub fn names(&self) -> impl Iterator<Item = &str> {
         self.entries.keys().map(String::as_str)
     }

@@ -30,7 +30,7 @@ const MAX_VALUES: usize = 1 << 20;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct NetworkManifest {
-    /// [`NetworkManifest::FORMAT`].
+    /// The format, which must be [`NetworkManifest::FORMAT`].
     pub format: String,
     /// The name that reports give its numbers.
     pub name: String,
@@ -100,7 +100,7 @@ impl std::fmt::Debug for Network {
 }
 
 impl NetworkManifest {
-    /// The field `format`.
+    /// Value of the field `format` of a manifest.
     pub const FORMAT: &str = "wildcity.network/1";
 
     /// Reads and checks the text of a manifest; `file` is named in errors.
@@ -170,7 +170,7 @@ impl Network {
         Ok(Self { manifest, worker: Mutex::new(worker) })
     }
 
-    /// The manifest.
+    /// The manifest that the network was loaded from.
     pub fn manifest(&self) -> &NetworkManifest {
         &self.manifest
     }

@@ -251,7 +251,6 @@ impl Worker {
     }
 }
 
-/// Builds a session.
 fn session(
     environment: &Environment,
     files: GraphFiles,

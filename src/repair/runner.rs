@@ -34,7 +34,6 @@ impl Runner {
         self.manifest.inputs.iter().filter(|input| input.role.channels().is_some())
     }
 
-    /// Trust and constants.
     pub(crate) fn scalars(&self, view: &View<'_>) -> Result<Vec<Feed>, RepairError> {
         let inputs = self.manifest.inputs.iter().filter(|input| input.role.channels().is_none());
         let feed = |input: &Input| {

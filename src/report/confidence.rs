@@ -111,8 +111,11 @@ impl Observed {
         let widest_px = point.views.iter().map(|view| view.camera.width_px).fold(1, u32::max);
         // Never enlarged: a larger image has no more content.
         let scale = (WIDTH_PX / f64::from(widest_px)).min(1.0);
-        let views = point.views.iter().map(|view| scaled(*view, scale));
-        let views = views.collect::<Result<Vec<View>, CameraError>>()?;
+        let views = point
+            .views
+            .iter()
+            .map(|view| scaled(*view, scale))
+            .collect::<Result<Vec<View>, CameraError>>()?;
 
         // Colour and opacity of each.
         let profile = &resident.version.manifest.profile;
@@ -132,8 +135,8 @@ impl Observed {
         backend.render(&frame, &mut targets, &|_, _| {})?;
 
         let images = views.iter().zip(&opacity);
-        let trusts = images.map(|(view, opacity)| coverage.trust(&world_from_rig, view, opacity));
-        let trusts = trusts.collect();
+        let trusts =
+            images.map(|(view, opacity)| coverage.trust(&world_from_rig, view, opacity)).collect();
         // A rig has at least one camera.
         Ok(Self { trusts, first_view: views[0], first_rgb8: rgb8.swap_remove(0) })
     }
@@ -145,8 +148,8 @@ impl Observed {
             camera.width_px,
             camera.height_px,
             JPEG_QUALITY,
-        );
-        let jpeg = jpeg.map_err(|reason| ReportError::Encode { reason })?;
+        )
+        .map_err(|reason| ReportError::Encode { reason })?;
         Ok(ViewImage { sample_point: point.name.clone(), jpeg })
     }
 }

@@ -41,8 +41,11 @@ impl Expected {
         let windows: usize = points.iter().map(|point| point.windows.len()).sum();
         let timed = points.iter().filter(|point| point.offset_m == 0.0).count();
         let reference_s = window_s(benchmark)? * (windows * references) as f64;
-        let tried = benchmark.backends.iter().map(|backend| tried(benchmark, &**backend));
-        let tried = tried.collect::<Result<Vec<Tried>, ReportError>>()?;
+        let tried = benchmark
+            .backends
+            .iter()
+            .map(|backend| tried(benchmark, &**backend))
+            .collect::<Result<Vec<Tried>, ReportError>>()?;
         let steps = timed as f64 * f64::from(benchmark.repeat + 1);
         let setting_s = |setting: &Setting| {
             let Tried { step_s, windows_s } = tried[setting.backend];

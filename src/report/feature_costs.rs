@@ -74,7 +74,7 @@ pub struct DeviceCounts {
     pub read_back_bytes_per_pixel: u64,
 }
 
-/// Headings of [`ResourceCounts::cells`].
+/// Headings of the columns, in the order of [`ResourceCounts::cells`].
 pub const COLUMNS: [&str; 11] = [
     "Gaussians",
     "host memory, B per Gaussian",

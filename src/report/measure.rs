@@ -331,8 +331,8 @@ fn received(setting: &Setting, view: &View, drawing: &RenderedImage) -> Result<I
     let mut image = displayed(view, drawing);
     // Without an encoding the values are compared before rounding, see the head of this file.
     if setting.encoding.is_some() {
-        let encoded = encode(setting.encoding, view, &drawing.rgb8);
-        let encoded = encoded.map_err(|reason| ReportError::Encode { reason })?;
+        let encoded = encode(setting.encoding, view, &drawing.rgb8)
+            .map_err(|reason| ReportError::Encode { reason })?;
         let rgb8 = match encoded {
             // `Raw`: the 8 bits themselves.
             None => drawing.rgb8.clone(),
@@ -345,8 +345,9 @@ fn received(setting: &Setting, view: &View, drawing: &RenderedImage) -> Result<I
 
 fn decode(file: &[u8]) -> Result<Vec<u8>, ReportError> {
     let failed = |reason: String| ReportError::Encode { reason };
-    let reader = ImageReader::new(Cursor::new(file)).with_guessed_format();
-    let reader = reader.map_err(|error| failed(error.to_string()))?;
+    let reader = ImageReader::new(Cursor::new(file))
+        .with_guessed_format()
+        .map_err(|error| failed(error.to_string()))?;
     let image = reader.decode().map_err(|error| failed(error.to_string()))?;
     Ok(image.into_rgb8().into_raw())
 }

@@ -179,8 +179,8 @@ pub fn recommend(
 /// required time.
 fn best_candidate<'a>(goal: Goal, candidates: &[Candidate<'a>]) -> Option<Candidate<'a>> {
     // With the margin: the goal has to be reached at points that were not measured.
-    let reaching = candidates.iter().copied();
-    let mut reaching = reaching.filter(|c| goal.is_met_by(c.assessment.guaranteed));
+    let mut reaching =
+        candidates.iter().copied().filter(|c| goal.is_met_by(c.assessment.guaranteed));
     match goal {
         Goal::AtLeastDb(_) => reaching
             // `min_by` returns the first of equal ones: the order of the list decides.
@@ -231,8 +231,9 @@ impl Recommendation {
         let changed_field = |change: &String| {
             // A change has the form field=value; without `=` it would have failed above.
             let key = change.split_once('=').map_or(change.as_str(), |(key, _)| key);
-            let value = all_fields.get(key);
-            let value = value.ok_or_else(|| bad(key, "it is missing in the JSON".to_owned()))?;
+            let value = all_fields
+                .get(key)
+                .ok_or_else(|| bad(key, "it is missing in the JSON".to_owned()))?;
             Ok((key.to_owned(), value.clone()))
         };
         self.profile.iter().map(changed_field).collect::<Result<_, _>>().map(ProfileOverrides::new)
@@ -290,8 +291,10 @@ impl Goal {
             Self::AtMostMs(_) => result.p95_ms,
         };
         let values_at = |for_selection: bool| {
-            let results = measurement.by_sample_point.iter();
-            let results = results.filter(move |result| result.for_selection == for_selection);
+            let results = measurement
+                .by_sample_point
+                .iter()
+                .filter(move |result| result.for_selection == for_selection);
             results.filter_map(value).collect::<Vec<f64>>()
         };
         let selection = values_at(true);

@@ -169,8 +169,8 @@ fn measure_repair(
     backend: &dyn Backend,
     progress: Progress<'_>,
 ) -> anyhow::Result<Option<RepairReport>> {
-    let models = twin.models.names().map(|name| twin.models.get(name));
-    let models = models.collect::<Result<Vec<_>, _>>()?;
+    let models =
+        twin.models.names().map(|name| twin.models.get(name)).collect::<Result<Vec<_>, _>>()?;
     if models.is_empty() {
         return Ok(None);
     }

@@ -211,7 +211,7 @@ impl SamplePoint {
 pub(super) fn scaled(view: View, scale: f64) -> Result<View, CameraError> {
     // At least 1: no side vanishes.
     let side_px = |px: u32| ((f64::from(px) * scale).round() as u64).max(1);
-    let camera = view.camera;
-    let camera = camera.scaled(side_px(camera.width_px), side_px(camera.height_px))?;
+    let own = view.camera;
+    let camera = own.scaled(side_px(own.width_px), side_px(own.height_px))?;
     Ok(View { camera, ..view })
 }

@@ -96,8 +96,8 @@ impl Step<'_> {
         let ms = start.elapsed().as_secs_f64() * 1e3;
 
         // After the time was taken, as the error is of no concern to it.
-        let sent_bytes = sent_bytes.into_inner();
-        let sent_bytes = sent_bytes.map_err(|reason| ReportError::Encode { reason })?;
+        let sent_bytes =
+            sent_bytes.into_inner().map_err(|reason| ReportError::Encode { reason })?;
         Ok(StepRun { ms, sent_bytes })
     }
 }

@@ -98,7 +98,8 @@ impl<'a> Input<'a> {
     fn deviation(&self) -> Measured {
         // `future` leaves out the ego's own pose at the decision, which is no part of the plan.
         let of_pair = |pair: &[&Plan]| {
-            let [before, plan] = [pair[0], pair[1]];
+            let before = pair[0];
+            let plan = pair[1];
             // Only times that both plans have: beyond its end the earlier one is not extrapolated.
             let common = plan.future().iter().filter(|pose| pose.time_us <= before.end_us());
             let distances_m = common.filter_map(|pose| {
@@ -138,8 +139,8 @@ impl<'a> Input<'a> {
     /// Mean over the decisions of the mean distance between plan and recorded drive, at the steps
     /// up to a time ahead.
     fn ade(&self, delta_us: i64) -> Measured {
-        let reference = self.record.reference.as_ref();
-        let reference = reference.ok_or(Missing::new("needs the recorded drive"))?;
+        let reference =
+            self.record.reference.as_ref().ok_or(Missing::new("needs the recorded drive"))?;
         let found = mean(
             self.plans.iter().filter_map(|plan| self.average_error_m(plan, reference, delta_us)),
         );

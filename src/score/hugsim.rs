@@ -104,7 +104,7 @@ impl HugsimBox {
     }
 }
 
-/// Judges one decision.
+/// Judges one decision by HUGSIM's rules.
 pub fn decision(decision: &Decision<'_>) -> DecisionScore {
     // The plan begins with the pose of the ego itself.
     let ego = PlanPose { position_m: decision.ego.footprint.center_m, yaw_rad: decision.yaw_rad };

@@ -32,7 +32,7 @@ const LONG_STEPS: &str = "what is on the way within a step of more than 0.5 s wa
 /// Progress is not measured along a recording that moves less than this, in metres.
 const LEAST_WAY_M: f64 = 2.0;
 
-/// The result.
+/// The verdict on an episode as a whole.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Judgement {
@@ -77,7 +77,6 @@ pub enum Criterion {
 }
 
 impl Criterion {
-    /// All criteria.
     pub const ALL: [Self; 4] = [Self::Contact, Self::Static, Self::OffRoad, Self::Progress];
 
     /// The name in results: that of its fault, or the beginning of their names.
@@ -148,7 +147,7 @@ impl Fault {
     }
 }
 
-/// Judges an episode.
+/// Judges an episode by WildCity's own criteria.
 pub fn verdict(record: &DriveRecord) -> Verdict {
     let mut not_judged = Vec::new();
     // Criteria without their input are collected, not returned early: a fault of another one still
@@ -287,8 +286,8 @@ fn least_ttc_s(record: &DriveRecord) -> Option<f64> {
         let own =
             Moving { footprint: shape.footprint(&ego), velocity_mps: ego.world_velocity_mps() };
         tracks.iter().filter_map(move |track: &Track| {
-            let other = track.samples.get(step).copied().flatten()?;
-            let other = Moving { footprint: other.footprint, velocity_mps: other.velocity_mps };
+            let sample = track.samples.get(step).copied().flatten()?;
+            let other = Moving { footprint: sample.footprint, velocity_mps: sample.velocity_mps };
             time_to_contact_s(&own, &other)
         })
     };

@@ -40,7 +40,7 @@ impl Plan {
         self.poses[self.poses.len() - 1].time_us
     }
 
-    /// The future poses.
+    /// The poses after the first one, which is that of the decision.
     pub fn future(&self) -> &[PlannedPose] {
         &self.poses[1..]
     }

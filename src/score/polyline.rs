@@ -38,7 +38,7 @@ impl Polyline {
         Some(Self { points_m, stations_m })
     }
 
-    /// Its points.
+    /// Its corners in order, in metres.
     pub fn points_m(&self) -> &[DVec2] {
         &self.points_m
     }
@@ -72,7 +72,8 @@ impl Polyline {
         // Above 0, because the two stations differ.
         let length_m = self.stations_m[to] - self.stations_m[from];
         let t = ((station_m - self.stations_m[from]) / length_m).clamp(0.0, 1.0);
-        let [a, b] = [self.points_m[from], self.points_m[to]];
+        let a = self.points_m[from];
+        let b = self.points_m[to];
         (a.lerp(b, t), (b - a) / length_m)
     }
 

@@ -30,7 +30,7 @@ pub struct Score {
 }
 
 impl Missing {
-    /// The missing input.
+    /// A missing input, with the reason why it is missing.
     pub fn new(reason: impl Into<String>) -> Self {
         Self { reason: reason.into() }
     }

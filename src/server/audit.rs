@@ -65,7 +65,6 @@ pub(crate) enum Made {
     Nothing,
 }
 
-/// A line.
 #[derive(Serialize)]
 struct Line<'a> {
     time_us: u64,

@@ -211,8 +211,10 @@ impl SessionRegistry {
         let slot = Arc::new(AsyncMutex::new(SessionSlot::default()));
         let release = Arc::new(Notify::new());
         // The lock is free, because no other reference to it exists yet.
-        let guard = slot.clone().try_lock_owned();
-        let guard = guard.map_err(|_| Fault::Internal("a new slot is locked".to_owned()))?;
+        let guard = slot
+            .clone()
+            .try_lock_owned()
+            .map_err(|_| Fault::Internal("a new slot is locked".to_owned()))?;
         let newest = Newest::new();
         let entry = Entry {
             slot,
@@ -313,8 +315,8 @@ impl SessionRegistry {
             let slot = {
                 let entries = self.entries.lock();
                 // Other clients must not learn that the session exists.
-                let entry = entries.get(name).filter(|entry| entry.owner == owner);
-                let entry = entry.ok_or_else(unknown)?;
+                let entry =
+                    entries.get(name).filter(|entry| entry.owner == owner).ok_or_else(unknown)?;
                 // Without a holder the permit of `notify_one` would be stored, and would hit the
                 // next one.
                 if entry.parked.is_none() {

@@ -16,7 +16,6 @@ use crate::fault::{CloseStatus, Fault};
 use crate::limits;
 use crate::stream::Stream;
 
-/// A client's WebSocket.
 pub(crate) struct Socket {
     stream: WebSocketStream<Stream>,
     send_timeout: Duration,

@@ -132,12 +132,13 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
     // All clients of a server without tokens share one owner, the empty name.
     let uploaders = tokens.as_ref().map_or(1, Tokens::uploaders);
     let own_bytes = tokens.as_ref().map(Tokens::upload_bytes).unwrap_or_default();
-    let spool = Spool::open(SpoolMedium::directory(&uploads), limits.spool, uploaders, own_bytes);
-    let spool = spool.map(Arc::new).map_err(|error| {
-        let reason = format!("{}: {error}", uploads.display());
-        tracing::warn!("uploads are refused: {reason}");
-        reason
-    });
+    let spool = Spool::open(SpoolMedium::directory(&uploads), limits.spool, uploaders, own_bytes)
+        .map(Arc::new)
+        .map_err(|error| {
+            let reason = format!("{}: {error}", uploads.display());
+            tracing::warn!("uploads are refused: {reason}");
+            reason
+        });
 
     let mut disks = vec![("episodes", episodes.clone()), ("uploads", uploads)];
     // A twin at a URL has no disk here.

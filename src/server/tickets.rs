@@ -65,8 +65,7 @@ impl Tickets {
 
     fn redeem_at(&self, ticket: &str, now: Instant) -> Result<Arc<Grant>, Fault> {
         // Removed before it is checked: a ticket that is too old is used up, too.
-        let entry = self.entries.lock().remove(&key(ticket));
-        let entry = entry.filter(|entry| entry.is_good(now));
+        let entry = self.entries.lock().remove(&key(ticket)).filter(|entry| entry.is_good(now));
         Ok(entry.ok_or(Fault::UnknownTicket)?.grant)
     }
 }
@@ -108,8 +107,8 @@ mod tests {
             format!(r#"{{"name": "{index}", "role": "drive", "token": "token-token-{index:06}"}}"#)
         };
         let list: Vec<String> = (0..count).map(token).collect();
-        let tokens = Tokens::parse(format!(r#"{{"tokens": [{}]}}"#, list.join(",")).as_bytes());
-        let tokens = tokens.unwrap();
+        let tokens =
+            Tokens::parse(format!(r#"{{"tokens": [{}]}}"#, list.join(",")).as_bytes()).unwrap();
         let grant =
             |index: usize| tokens.grant(Some(format!("Bearer token-token-{index:06}").as_bytes()));
         (0..count).map(|index| grant(index).unwrap()).collect()

@@ -20,7 +20,7 @@ type Cell = watch::Sender<Option<Arc<Observation>>>;
 #[derive(Clone)]
 pub(crate) struct Newest(Arc<Cell>);
 
-/// A watcher's end.
+/// The end at which a watcher waits for observations.
 pub(crate) struct Watch {
     receiver: watch::Receiver<Option<Arc<Observation>>>,
     /// Weak, so that the end of the session is noticed.

@@ -32,7 +32,7 @@ pub struct Case {
     pub seed: u64,
     /// The values of the sweep.
     pub values: Values,
-    /// The scenario, resolved.
+    /// The scenario with the values of its sweep, resolved against the twin.
     pub resolved: Arc<Scenario>,
     /// The line that heads its record.
     pub line: Arc<ScenarioLine>,

@@ -18,7 +18,7 @@ use crate::case::Case;
 pub enum BuiltIn {
     /// Drives as recorded. On the bare twin it must pass: it is each scenario's own test.
     Log,
-    /// Brakes, and stands.
+    /// Brakes to standstill, and stays there.
     Stand,
     /// Follows the recorded line by the Intelligent Driver Model.
     Idm,
@@ -43,7 +43,7 @@ impl BuiltIn {
         }
     }
 
-    /// Its name.
+    /// The name that `--agent` takes.
     pub fn name(self) -> &'static str {
         match self {
             Self::Log => "log",

@@ -25,7 +25,6 @@ pub enum ExitCode {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Ending {
     pub code: ExitCode,
-    /// Why, in words.
     pub why: String,
 }
 

@@ -17,7 +17,7 @@ use crate::file::OFF_MODEL;
 use crate::finish::Finished;
 use crate::technical::Technical;
 
-/// One episode.
+/// The result of one episode.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct EpisodeEntry {
     pub name: String,

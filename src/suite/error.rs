@@ -19,7 +19,7 @@ pub enum SuiteError {
     /// A file cannot be read or written.
     #[error("cannot {what} {}: {cause}", path.display())]
     Io {
-        /// `read`, `write` ..
+        /// The failed operation as a verb: `read`, `write` and so on.
         what: &'static str,
         path: PathBuf,
         /// The operating system's error.

@@ -21,7 +21,7 @@ use crate::limits;
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SuiteFile {
-    /// `wildcity.suite/1`.
+    /// Name of the format: `wildcity.suite/1`.
     pub format: String,
     /// Name of the suite.
     pub name: String,

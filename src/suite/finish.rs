@@ -13,7 +13,6 @@ use wildcity_sim::Dynamics;
 use crate::case::Case;
 use crate::technical::Technical;
 
-/// A driven episode.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Finished {
     /// Its file's name without the directory.
@@ -41,11 +40,11 @@ fn finish_file(case: &Case, record: &Path) -> Result<Finished, Technical> {
         EpisodeFile::read(record).map_err(|error| Technical::server(error.to_string()))?;
     // What was driven must be what was ordered, before anything is judged.
     check(case, &episode)?;
-    let end = episode.end.clone();
-    let end = end.ok_or_else(|| Technical::new("agent_lost", "the record has no end"))?;
+    let end =
+        episode.end.clone().ok_or_else(|| Technical::new("agent_lost", "the record has no end"))?;
     // By its name in the record: a newer server may write an outcome that this build does not know.
-    let outcome = Outcome::deserialize(end.outcome.as_str().into_deserializer());
-    let outcome = outcome.map_err(|_: ValueError| {
+    let known = Outcome::deserialize(end.outcome.as_str().into_deserializer());
+    let outcome = known.map_err(|_: ValueError| {
         let outcome = &end.outcome;
         Technical::server(format!(
             "the session ended as {outcome}, which this program does not know"

@@ -18,7 +18,7 @@ pub const STEPS: u64 = 6_000;
 /// Longest step of a suite, in microseconds: no verdict passes with longer ones.
 pub const STEP_US: i64 = wildcity_score::own::MOST_STEP_US;
 
-/// Episodes at once.
+/// Most episodes that are driven at once.
 pub const JOBS: usize = 64;
 
 /// How long an external agent may take for an episode, unless the command line says otherwise.

@@ -87,7 +87,7 @@ fn worst_fault(episode: &EpisodeEntry) -> Option<&FaultLine> {
     episode.faults.iter().min_by_key(|fault| severity(fault))
 }
 
-/// Smaller is worse.
+/// Rank of a fault: the smaller it is, the worse.
 fn severity(fault: &FaultLine) -> u8 {
     match fault.fault.as_str() {
         "progress" => 2,

@@ -17,7 +17,7 @@ use crate::limits;
 /// give the same bytes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SuiteResult {
-    /// `wildcity.suite-result/1`.
+    /// Name of the format: `wildcity.suite-result/1`.
     pub format: String,
     /// Name of the suite.
     pub suite: String,
@@ -220,7 +220,7 @@ impl SuiteResult {
         })
     }
 
-    /// The file `result.json`.
+    /// The text of the file `result.json`.
     pub fn to_json(&self) -> String {
         // Numbers, texts and maps with text keys: writing them into memory cannot fail.
         serde_json::to_string_pretty(self).unwrap_or_default() + "\n"

@@ -42,8 +42,8 @@ impl Tail {
         let lines = self.lines.lock().unwrap_or_else(PoisonError::into_inner);
         let text = lines.iter().map(String::as_str).collect::<Vec<_>>().join("\n");
         // Whole characters of the last bytes.
-        let from = text.len().saturating_sub(limits::STDERR_BYTES);
-        let from = (from..=text.len()).find(|&at| text.is_char_boundary(at)).unwrap_or(0);
+        let least = text.len().saturating_sub(limits::STDERR_BYTES);
+        let from = (least..=text.len()).find(|&at| text.is_char_boundary(at)).unwrap_or(0);
         text[from..].to_owned()
     }
 }

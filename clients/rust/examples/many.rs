@@ -30,7 +30,8 @@ async fn main() -> anyhow::Result<()> {
         let (many_s, many_hash) = many_connections(url, twin, sessions, steps).await?;
         anyhow::ensure!(one_hash == many_hash, "the images differ");
         let all = sessions as f64 * f64::from(steps);
-        let [one, many] = [all / one_s, all / many_s];
+        let one = all / one_s;
+        let many = all / many_s;
         println!(
             "round {round}: step_many {one:.0} steps/s, {sessions} connections {many:.0}: {:.2}",
             one / many

@@ -116,7 +116,7 @@ pub struct StepOptions {
 /// How an episode starts.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ResetOptions {
-    /// Its seed.
+    /// Seed of the episode's random draws.
     pub seed: u64,
     /// Where it starts; the session's start if `None`.
     pub start: Option<Start>,
@@ -133,7 +133,7 @@ pub struct Welcome {
     pub protocol: String,
     /// Name and version of the server.
     pub server: ServerInfo,
-    /// The server's limits.
+    /// Largest sizes, counts and times that the server accepts.
     pub limits: Limits,
     /// Name of the render backend.
     pub backend: String,
@@ -232,6 +232,7 @@ impl Client {
     ) -> Result<Resumed, ClientError> {
         self.sessions = std::iter::once(session.to_owned()).chain(also.iter().cloned()).collect();
         self.selected = Some(session.to_owned());
+        // The number may be any that the caller has stored, also the largest.
         self.next_seq = last_seq.saturating_add(1);
         self.resume_sessions(last_seq).await
     }
@@ -512,7 +513,10 @@ impl Client {
                 self.next_seq += 1;
                 self.connection = Some(connection);
             }
+            // A refused request keeps its number: the next one has the same.
             Err(ClientError::Refused { fatal: false, .. }) => self.connection = Some(connection),
+            // The connection is dropped: after a time-out the late answer would come in place of
+            // the next one.
             Err(error) => self.disconnect_reason = error.to_string(),
         }
         result
@@ -564,6 +568,7 @@ impl Client {
     /// The name of the selected session for a request, which needs a name only if there are several
     /// sessions.
     fn named(&self) -> Option<String> {
+        // With one session the server needs no name.
         self.selected.clone().filter(|_| self.sessions.len() > 1)
     }
 
@@ -578,6 +583,8 @@ impl Client {
     /// Removes the session that was closed, and selects the last of the others.
     fn remove_selected(&mut self) {
         match self.sessions.len() {
+            // The only session may have been selected by another name, and is the one that was
+            // closed.
             0 | 1 => self.sessions.clear(),
             _ => self.sessions.retain(|name| Some(name) != self.selected.as_ref()),
         }

@@ -56,6 +56,7 @@ impl Endpoint {
     /// Checks the address and the options; nothing is sent yet.
     pub(crate) fn new(url: &str, options: &ConnectOptions) -> Result<Self, ClientError> {
         let failed = |reason: String| ClientError::Connect { url: url.to_owned(), reason };
+        // Made once: a later reconnection sends the same headers.
         let mut upgrade = url.into_client_request().map_err(|error| failed(error.to_string()))?;
 
         let headers = upgrade.headers_mut();
@@ -196,6 +197,7 @@ impl Connection {
             other => return Err(unexpected("shared_memory", &other)),
         };
         let (memory, proof) = SharedMemory::open(&offer)?;
+        // The proof is a request of its own, and each request has its own number.
         let seq = seq + 1;
         let proven = Request::ShareMemory { seq, proof: Some(proof) };
         match self.exchange(&proven, seq, HELLO_TIMEOUT).await? {
@@ -226,6 +228,7 @@ impl Connection {
                     let reason = "the server closed the connection".to_owned();
                     return Err(ClientError::Disconnected(reason));
                 }
+                // The library answers pings by itself.
                 Some(Ok(Message::Ping(_) | Message::Pong(_) | Message::Frame(_))) => {}
                 Some(Err(error)) => return Err(ClientError::Disconnected(error.to_string())),
             }
@@ -238,6 +241,7 @@ fn unexpected(expected: &'static str, got: &Incoming) -> ClientError {
 }
 
 fn decode(frame: Bytes) -> Result<Incoming, ClientError> {
+    // A clone of `Bytes` counts a reference, and copies no pixels.
     match Observation::decode(frame.clone()) {
         Ok(observation) => Ok(Incoming::Observation(Box::new(observation))),
         // The answer to `step_many` has another metadata.

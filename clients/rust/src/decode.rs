@@ -35,6 +35,7 @@ pub(crate) fn png(file: &[u8], size: [usize; 2]) -> Result<Vec<u8>, DecodeError>
     let info = reader.info();
     check_size([info.width as usize, info.height as usize], size)?;
     let format = reader.output_color_type();
+    // Servers write nothing else; converting would hide that the file is another one.
     if format != (ColorType::Rgb, BitDepth::Eight) {
         return Err(invalid(format!("its pixels are {format:?}; 8-bit RGB is expected")));
     }

@@ -12,9 +12,9 @@ pub enum ClientError {
     /// The client could not connect.
     #[error("cannot connect to {url}: {reason}")]
     Connect {
-        /// The address.
+        /// Address of the server, as it was given.
         url: String,
-        /// The cause.
+        /// What failed: the address, the token, TLS or the network.
         reason: String,
     },
     /// The server refused the request. Nothing changed, and the request can be sent again.
@@ -107,7 +107,7 @@ pub enum FrameError {
     Image {
         /// Name of the tensor.
         name: String,
-        /// The decoder's error.
+        /// What the decoder found wrong in the file.
         reason: String,
     },
     /// Pixels, or the images' hashes, do not have the hash that the metadata names.

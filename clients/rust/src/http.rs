@@ -49,7 +49,7 @@ pub enum HttpError {
     /// The text is not the address of a server.
     #[error("{url:?} is not a server: expected http://HOST:PORT or https://HOST:PORT")]
     Url {
-        /// The text.
+        /// The text as it was given.
         url: String,
     },
     /// The token cannot be sent.
@@ -58,21 +58,21 @@ pub enum HttpError {
     /// TLS cannot be set up.
     #[error("cannot set up TLS: {reason}")]
     Tls {
-        /// The cause.
+        /// What is wrong with the root certificates, or missing.
         reason: String,
     },
     /// The server did not answer, or its answer was cut off.
     #[error("no answer from {server}: {reason}")]
     NoAnswer {
-        /// The server.
+        /// Host and port of the server.
         server: String,
-        /// The cause.
+        /// What the network reported.
         reason: String,
     },
     /// The server refused the request.
     #[error("refused, {status}: {message}")]
     Refused {
-        /// HTTP status.
+        /// Status of the answer, such as 409.
         status: u16,
         /// Code of the error; `None` if the answer is not of this protocol.
         code: Option<Code>,
@@ -87,15 +87,15 @@ pub enum HttpError {
     /// The answer does not conform to the protocol.
     #[error("cannot read the answer of {server}: {reason}")]
     Answer {
-        /// The server.
+        /// Host and port of the server.
         server: String,
-        /// The cause.
+        /// What is wrong with the answer.
         reason: String,
     },
     /// A file cannot be read.
     #[error("cannot read {path}: {cause}")]
     File {
-        /// The file.
+        /// Path of the file, as it was given.
         path: String,
         /// The error of the operating system.
         cause: std::io::Error,
@@ -112,14 +112,15 @@ impl HttpClient {
 
         let mut headers = HeaderMap::new();
         if let Some(token) = &options.token {
-            let bearer = HeaderValue::try_from(format!("Bearer {token}"));
-            let mut bearer = bearer.map_err(|_| HttpError::Token)?;
+            let mut bearer =
+                HeaderValue::try_from(format!("Bearer {token}")).map_err(|_| HttpError::Token)?;
             bearer.set_sensitive(true);
             headers.insert(AUTHORIZATION, bearer);
         }
 
         let tls = match server.scheme() {
             "https" => tls::client_config(&options.root_certificates_pem),
+            // Without TLS a system without root certificates must not fail.
             _ => tls::no_roots_config(),
         };
         let http = reqwest::Client::builder()
@@ -128,6 +129,7 @@ impl HttpClient {
             .connect_timeout(limits::HTTP_CONNECT_TIMEOUT)
             .http1_only()
             .pool_max_idle_per_host(0)
+            // The protocol has no redirections: following one would send a scene to another host.
             .redirect(Policy::none())
             .no_proxy()
             .build()
@@ -213,9 +215,9 @@ impl HttpClient {
         let DriveSection { name, from_m, to_m, every_m } = section;
         let path = ["v1", "twins", twin, "trajectories", name];
         let version = version.map(|number| ("version", number.to_string()));
-        let stations = [("from_m", from_m), ("to_m", to_m), ("every_m", every_m)];
+        let fields = [("from_m", from_m), ("to_m", to_m), ("every_m", every_m)];
         let stations =
-            stations.into_iter().filter_map(|(field, value)| Some((field, (*value)?.to_string())));
+            fields.into_iter().filter_map(|(field, value)| Some((field, (*value)?.to_string())));
         let mut url = self.url(&path);
         url.query_pairs_mut().extend_pairs(version.into_iter().chain(stations));
         let answer = self.send(self.http.request(Method::GET, url), limits::HTTP_TIMEOUT).await?;
@@ -258,6 +260,7 @@ impl HttpClient {
     fn url(&self, path: &[&str]) -> Url {
         let mut url = self.server.clone();
         if let Ok(mut segments) = url.path_segments_mut() {
+            // Segments are escaped one by one: a name cannot add a slash to the path.
             segments.clear().extend(path);
         }
         url
@@ -270,6 +273,7 @@ impl HttpClient {
         time_limit: Duration,
     ) -> Result<Vec<u8>, HttpError> {
         let no_answer = |error: reqwest::Error| {
+            // Connecting has a limit of its own, which is not `time_limit`.
             if error.is_timeout() && !error.is_connect() {
                 self.no_answer(&format!("none within {time_limit:?}"))
             } else {
@@ -280,6 +284,7 @@ impl HttpClient {
         let status = response.status();
         let mut body = Vec::new();
         while let Some(chunk) = response.chunk().await.map_err(no_answer)? {
+            // The length that the answer announces is not trusted: it may be absent or wrong.
             if body.len() + chunk.len() > limits::HTTP_ANSWER_BYTES {
                 let limit = limits::HTTP_ANSWER_BYTES;
                 return Err(self.unreadable(&format!("it is larger than {limit} bytes")));
@@ -297,7 +302,7 @@ impl HttpClient {
         HttpError::Answer { server: self.authority(), reason: reason.to_string() }
     }
 
-    /// `host:port`, for messages.
+    /// Host and port of the server, for messages.
     fn authority(&self) -> String {
         self.server.authority().to_owned()
     }
@@ -321,6 +326,7 @@ fn parse_server(text: &str) -> Option<Url> {
 
 /// Describes an error with its causes: the error itself only says that a request failed.
 fn describe(error: reqwest::Error) -> String {
+    // The message of `no_answer` names the server already.
     let error = error.without_url();
     let mut causes = Vec::new();
     let mut source = error.source();
@@ -338,6 +344,7 @@ fn refused(status: StatusCode, body: &[u8]) -> HttpError {
             HttpError::Refused { status, code: Some(code), message, cells, offset }
         }
         Err(_) => {
+            // Not of this protocol: a proxy answers with a page, of which the beginning is enough.
             let message = String::from_utf8_lossy(&body[..body.len().min(200)]).into_owned();
             HttpError::Refused { status, code: None, message, cells: Vec::new(), offset: None }
         }

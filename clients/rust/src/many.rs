@@ -35,13 +35,15 @@ impl Many {
         let texts = tensors.metadata().as_ref();
         let text = texts.and_then(|texts| texts.get("many")).ok_or(FrameError::NoObservation)?;
         let metadata: ManyMetadata = serde_json::from_str(text).map_err(FrameError::Observation)?;
+        // A safetensors file begins with the length of its header, in eight bytes.
         let data_start = size_of::<u64>() + header_bytes;
         let stepped = |SessionAnswer { session, tensor, error }: SessionAnswer| {
             let result = match (tensor, error) {
                 (None, Some(refusal)) => Err(refusal),
                 (Some(name), None) => {
-                    let info = tensors.info(&name);
-                    let info = info.ok_or_else(|| FrameError::Missing { name: name.clone() })?;
+                    let info = tensors
+                        .info(&name)
+                        .ok_or_else(|| FrameError::Missing { name: name.clone() })?;
                     if info.dtype != Dtype::U8 || info.shape.len() != 1 {
                         return Err(FrameError::Tensor {
                             name,
@@ -50,6 +52,8 @@ impl Many {
                         });
                     }
                     let (start, end) = info.data_offsets;
+                    // Each observation is a part of the same buffer: nothing is copied.
+                    // `read_metadata` has checked that all offsets are within it.
                     let frame = message.slice(data_start + start..data_start + end);
                     let observation = Observation::decode(frame)?;
                     let found = &observation.metadata().session;
@@ -60,6 +64,7 @@ impl Many {
                     }
                     Ok(observation)
                 }
+                // Neither, or both: an answer is one of two.
                 (_, _) => return Err(FrameError::Missing { name: format!("session/{session}") }),
             };
             Ok(Stepped { session, result })

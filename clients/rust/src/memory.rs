@@ -51,6 +51,7 @@ impl SharedMemory {
         if found.as_os_str() != offer.target.as_str() {
             return Err(failed(format!("it is {}, not {}", found.display(), offer.target)));
         }
+        // The length comes from the peer, and is allocated below.
         if offer.proof_bytes > PROOF_BYTES {
             return Err(failed(format!("its proof has {} bytes", offer.proof_bytes)));
         }
@@ -63,12 +64,14 @@ impl SharedMemory {
 
     /// Copies a message out of the memory.
     pub(crate) async fn read(&self, offset: u64, bytes: u64) -> Result<Bytes, ClientError> {
+        // Both numbers come from the peer: their sum may overflow.
         let inside = offset.checked_add(bytes).is_some_and(|end| end <= self.size);
         if !inside || bytes > OBSERVATION_BYTES as u64 {
             let place = format!("{bytes} bytes at {offset} of {}", self.size);
             return Err(ClientError::SharedMemory(format!("a message is outside of it: {place}")));
         }
         let file = self.file.clone();
+        // Copying tens of megabytes would hold up other tasks of this thread.
         let read = spawn_blocking(move || {
             let mut message = vec![0; bytes as usize];
             read_exact_at(&file, &mut message, offset).map(|()| Bytes::from(message))

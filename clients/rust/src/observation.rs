@@ -66,6 +66,7 @@ impl Observation {
         let text =
             texts.and_then(|texts| texts.get("observation")).ok_or(FrameError::NoObservation)?;
         let metadata = serde_json::from_str(text).map_err(FrameError::Observation)?;
+        // A safetensors file begins with the length of its header, in eight bytes.
         let data_start = size_of::<u64>() + header_bytes;
         let observation = Self { metadata, tensors, data_start, frame };
         observation.check_tensors()?;
@@ -148,13 +149,15 @@ impl Observation {
         let mut frame_hasher = blake3::Hasher::new();
         for image in self.images() {
             image.verify()?;
-            let hash = &image.metadata.hash;
+            let text = &image.metadata.hash;
             // A text that is not a hash equals no hash.
-            let hash = blake3::Hash::from_hex(hash).map_err(|_| FrameError::Hash {
+            let hash = blake3::Hash::from_hex(text).map_err(|_| FrameError::Hash {
                 name: image.metadata.tensor.clone(),
-                found: hash.clone(),
+                found: text.clone(),
                 expected: "64 hex digits".to_owned(),
             })?;
+            // Of the images' hashes and not of their pixels, so that it can be compared for JPEG
+            // images, too.
             frame_hasher.update(hash.as_bytes());
         }
         let found = frame_hasher.finalize().to_hex().to_string();
@@ -173,6 +176,8 @@ impl Observation {
         // These exist only if the session asked for them.
         for (name, columns) in [(IMU, &[6][..]), (WHEEL_SPEED, &[])] {
             if let Some(info) = self.tensors.info(name) {
+                // The number of samples is that of the steps since the last observation: any is
+                // right.
                 let samples = info.shape.first().copied().unwrap_or_default();
                 self.check_tensor(name, Dtype::F32, &[&[samples], columns].concat())?;
             }
@@ -225,6 +230,7 @@ impl Observation {
     /// Checks that the tensor of a JPEG or PNG file is one-dimensional bytes, of any length.
     fn check_file(&self, name: &str) -> Result<(), FrameError> {
         let info = self.tensors.info(name).ok_or_else(|| missing(name))?;
+        // The size of a compressed file is not known beforehand: only that it has one dimension.
         let bytes = info.shape.iter().product();
         self.check_tensor(name, Dtype::U8, &[bytes])
     }
@@ -312,6 +318,7 @@ impl<'a> ImageView<'a> {
     /// Width and height, in pixels.
     fn size(&self) -> [usize; 2] {
         [self.metadata.width, self.metadata.height]
+            // A size that does not fit equals the shape of no tensor, and so is refused.
             .map(|side_px| usize::try_from(side_px).unwrap_or(usize::MAX))
     }
 
@@ -362,6 +369,7 @@ fn compare_hashes(name: &str, found: String, expected: &str) -> Result<(), Frame
 /// Little-endian floats: in place if the machine is little-endian and the bytes are aligned to 4,
 /// otherwise copied. Bytes after a JPEG of odd length are not aligned.
 fn floats(bytes: &[u8]) -> Cow<'_, [f32]> {
+    // The cast fails if the bytes are not aligned, or no multiple of four.
     match bytemuck::try_cast_slice(bytes) {
         Ok(floats) if cfg!(target_endian = "little") => Cow::Borrowed(floats),
         _ => Cow::Owned(

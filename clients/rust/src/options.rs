@@ -33,7 +33,7 @@ impl ConnectOptions {
     }
 }
 
-/// Hides the token.
+/// Shows whether there is a token, and not the token.
 impl fmt::Debug for ConnectOptions {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let token = if self.token.is_some() { "hidden" } else { "none" };

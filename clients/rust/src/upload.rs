@@ -32,6 +32,7 @@ impl HttpClient {
         path: &Path,
         on_progress: &mut (dyn FnMut(u64, u64) + Send),
     ) -> Result<Upload, HttpError> {
+        // The digest names the upload: the server finds by it what an earlier attempt has left.
         let announcement = self.announce(path).await?;
         let mut failures = 0;
         let mut furthest = 0;
@@ -53,12 +54,14 @@ impl HttpClient {
             if failures >= limits::HTTP_ATTEMPTS {
                 return Err(failure);
             }
+            // `failures` is less than HTTP_ATTEMPTS here, so that the power stays small.
             tokio::time::sleep(limits::HTTP_RETRY_DELAY * 2_u32.pow(failures)).await;
         }
     }
 
     /// Reads the whole file for its size and digest.
     async fn announce(&self, path: &Path) -> Result<NewUpload, HttpError> {
+        // Hashing a large file takes minutes, in which this thread has to serve other tasks.
         let owned_path = path.to_owned();
         let announcement = tokio::task::spawn_blocking(move || announcement(&owned_path)).await;
         announcement
@@ -87,6 +90,7 @@ impl HttpClient {
         let mut file = File::open(path).map_err(|cause| unreadable_file(path, cause))?;
         file.seek(SeekFrom::Start(upload.offset)).map_err(|cause| unreadable_file(path, cause))?;
         let remaining = upload.size - upload.offset;
+        // Shared with the body, which is moved into the request and cannot be asked.
         let sent = Arc::new(AtomicU64::new(upload.offset));
         let request = self
             .request(Method::PATCH, &["v1", "uploads", &upload.id])
@@ -137,6 +141,7 @@ fn announcement(path: &Path) -> io::Result<NewUpload> {
         hasher.update(&buffer[..read]);
         size += read as u64;
     }
+    // The server takes a name, not a path: a separator of either system is none of it.
     let name = path.file_name().unwrap_or_default().to_string_lossy().replace(['/', '\\'], "_");
     Ok(NewUpload { name, size, digest: format!("blake3:{}", hasher.finalize().to_hex()) })
 }
@@ -163,6 +168,7 @@ fn read_chunk(mut file: File, remaining: u64) -> io::Result<(File, Bytes)> {
     if read == 0 {
         return Err(io::Error::other("the file became shorter during the upload"));
     }
+    // A read may give less than was asked for, in the middle of a file as well.
     bytes.truncate(read);
     Ok((file, bytes.into()))
 }

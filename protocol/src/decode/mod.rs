@@ -66,7 +66,7 @@ inbound!(NewActor, "new_actor");
 pub struct Refused {
     /// The message's `seq`, if it has exactly one and it is a number.
     pub seq: Option<u64>,
-    /// The mistake.
+    /// The first mistake of the message, in the order of its text.
     pub mistake: Mistake,
 }
 
@@ -127,6 +127,8 @@ pub fn decode<T: Inbound>(text: &str) -> Result<T, Refused> {
         },
     };
     let refused = |mistake| Refused { seq: walk::seq(&tree), mistake };
+    // From here on integers are written as their types need them, so that serde reads `1e5` as
+    // well.
     let value = walk::checked(T::shapes(), &tree).map_err(refused)?;
     serde_json::from_value(value).map_err(|error| {
         let reason = format!("the schema accepts what the type does not: {error}");

@@ -10,6 +10,7 @@ pub(super) fn without_infinities(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     let mut rest = text;
     while let Some(first) = rest.chars().next() {
+        // A string is copied whole: the word NaN in it is text.
         let end = if first == '"' {
             string_end(rest)
         } else if is_number(first) {
@@ -18,6 +19,8 @@ pub(super) fn without_infinities(text: &str) -> String {
             first.len_utf8()
         };
         let (token, after) = rest.split_at(end);
+        // Rust reads `NaN`, `inf` and `Infinity` in any case and with a sign; `true` and `null` are
+        // no numbers to it, and stay.
         let infinite = is_number(first) && token.parse::<f64>().is_ok_and(|x| !x.is_finite());
         out.push_str(if infinite { "null" } else { token });
         rest = after;
@@ -27,6 +30,7 @@ pub(super) fn without_infinities(text: &str) -> String {
 
 /// Length of the string literal at the start of a text, its quotes included.
 fn string_end(text: &str) -> usize {
+    // The opening quote must not end the string.
     let mut escaped = true;
     for (index, byte) in text.bytes().enumerate() {
         match byte {

@@ -16,13 +16,12 @@ pub struct Shapes {
     pub(super) definitions: BTreeMap<String, Shape>,
 }
 
-/// Allowed values.
 #[derive(Debug)]
 pub(super) enum Shape {
-    /// Anything but `null`.
+    /// A value of any type except `null`.
     Any,
     Boolean,
-    /// A finite number.
+    /// A finite number, whole or not.
     Number,
     /// A whole number that fits a type.
     Integer(RangeInclusive<i128>),
@@ -62,9 +61,11 @@ impl Shapes {
     /// The schema has a keyword that this module does not support. A test reads every schema.
     pub(super) fn from_schema(schema: &str) -> Self {
         let schema: Value = serde_json::from_str(schema).expect("a schema is JSON");
-        let definitions = schema["$defs"].as_object().into_iter().flatten();
-        let definitions =
-            definitions.map(|(name, schema)| (name.clone(), Shape::from_value(schema)));
+        let definitions = schema["$defs"]
+            .as_object()
+            .into_iter()
+            .flatten()
+            .map(|(name, schema)| (name.clone(), Shape::from_value(schema)));
         Self { root: Shape::from_value(&schema), definitions: definitions.collect() }
     }
 
@@ -79,6 +80,7 @@ impl Shapes {
 
 impl Shape {
     fn from_value(schema: &Value) -> Self {
+        // A schema may also be `true`, which accepts anything.
         let Some(keywords) = schema.as_object() else { return Self::Any };
         if let Some(Value::String(target)) = keywords.get("$ref") {
             return Self::Defined(target.trim_start_matches("#/$defs/").to_owned());
@@ -103,6 +105,8 @@ impl Shape {
             Some("array") => {
                 let least = keywords.get("minItems").and_then(Value::as_u64);
                 let most = keywords.get("maxItems").and_then(Value::as_u64);
+                // Only a fixed length is a matter of type: other limits are checked where they are
+                // defined.
                 let len = least.filter(|_| least == most).map(|len| len as usize);
                 let item = keywords.get("items").map_or(Self::Any, Self::from_value);
                 Self::List { item: Box::new(item), len }
@@ -113,6 +117,7 @@ impl Shape {
     }
 
     fn from_alternatives(alternatives: &[Value]) -> Self {
+        // An enumeration whose values have descriptions is a list of constants in the schema.
         let shapes: Vec<Self> = alternatives.iter().map(Self::from_value).collect();
         if shapes.iter().all(|shape| matches!(shape, Self::Word(_))) {
             let words = shapes.into_iter().flat_map(|shape| match shape {
@@ -138,6 +143,9 @@ impl ObjectShape {
     fn from_keywords(keywords: &Map<String, Value>) -> Self {
         let fields = keywords.get("properties").and_then(Value::as_object).into_iter().flatten();
         let others = match keywords.get("additionalProperties") {
+            // In JSON Schema an absent keyword accepts any field. Types that answers have, too,
+            // ignore unknown fields there and so lack the keyword; in a request a field that is not
+            // read is a mistake.
             None | Some(Value::Bool(false)) => None,
             Some(shape) => Some(Box::new(Shape::from_value(shape))),
         };

@@ -6,7 +6,7 @@ use serde::de::{Error, MapAccess, SeqAccess, Visitor};
 use serde::{Deserialize, Deserializer};
 use serde_json::Number;
 
-/// A JSON value.
+/// A JSON value that keeps doubled fields, and all fields in their order.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum Tree {
     Null,

@@ -44,6 +44,7 @@ impl Walk<'_> {
     fn value(&mut self, shape: &Shape, tree: &Tree) -> Result<Value, Mistake> {
         if let Shape::Defined(name) = shape {
             let outer = self.in_pose;
+            // A pose that is not finite has an error code of its own.
             self.in_pose |= name == "Pose";
             let value = self.value(&self.shapes.definitions[name], tree);
             self.in_pose = outer;
@@ -69,6 +70,7 @@ impl Walk<'_> {
                 let Some(whole) = integer(number) else {
                     return Err(self.wrong("expected an integer, found a fraction"));
                 };
+                // Before exactness: a number beyond the range is too large however it is written.
                 if !accepted.contains(&whole) {
                     let reason = format!(
                         "is {number}; {} to {} is accepted",
@@ -81,6 +83,7 @@ impl Walk<'_> {
                     let reason = "write an integer of this size without a point or an exponent";
                     return Err(self.wrong(reason));
                 }
+                // Every accepted range is within u64 or i64: what is not the first is the second.
                 let unsigned = u64::try_from(whole).map(Value::from);
                 Ok(unsigned.unwrap_or_else(|_| Value::from(whole as i64)))
             }
@@ -134,6 +137,8 @@ impl Walk<'_> {
         let mut seen = BTreeSet::new();
         let mut values = Map::new();
         for (name, tree) in fields {
+            // In the order of the text, so that the first mistake that is reported is the first in
+            // the message.
             let value = self.within(&quoted(name), |walk| {
                 let Some(inner) = shape.fields.get(name).or(shape.others.as_deref()) else {
                     let known: Vec<&str> = shape.fields.keys().map(String::as_str).collect();
@@ -168,6 +173,8 @@ impl Walk<'_> {
                 | (Shape::List { .. }, Tree::List(_)) => 1,
                 _ => continue,
             };
+            // Of two that fit equally well, the first stays, so that the message is the same every
+            // time.
             if best.is_none_or(|(most, _)| known > most) {
                 best = Some((known, shape));
             }
@@ -194,6 +201,7 @@ impl Walk<'_> {
             Tree::Text(text) => Ok(Value::String(text.clone())),
             Tree::List(items) => self.list(&Shape::Any, None, items),
             Tree::Object(fields) => {
+                // Without fields of its own, so that `others` accepts every name.
                 let any = ObjectShape {
                     fields: Default::default(),
                     required: Vec::new(),
@@ -212,6 +220,8 @@ impl Walk<'_> {
         }
         self.path.push_str(part);
         let done = inner(self);
+        // One string for all levels: a path of its own for each value would allocate for every
+        // number.
         self.path.truncate(length);
         done
     }

@@ -54,6 +54,7 @@ impl<'de> Deserialize<'de> for BranchPoint {
             episode: Option<String>,
             step: Option<u64>,
         }
+        // Not serde's `untagged`, which can only say that no variant fits.
         let Either { session, snapshot, episode, step } = Either::deserialize(deserializer)?;
         match (session, snapshot, episode, step) {
             (Some(session), Some(snapshot), None, None) => Ok(Self::Snapshot { session, snapshot }),

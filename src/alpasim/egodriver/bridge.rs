@@ -37,7 +37,7 @@ const HISTORY_US: i64 = 100_000;
 /// How an episode is driven.
 #[derive(Clone, Debug)]
 pub struct EpisodeSettings {
-    /// `ws://HOST:PORT/v1/session`.
+    /// URL of the server's WebSocket, `ws://HOST:PORT/v1/session`.
     pub server: String,
     /// Token for the server.
     pub token: Option<String>,
@@ -133,8 +133,9 @@ impl From<PoseError> for BridgeError {
 pub async fn drive_episode(settings: &EpisodeSettings) -> Result<EpisodeReport, BridgeError> {
     // The driver first: it may take minutes to load, and a session would wait for it.
     let uuid = format!("wildcity-{}-{}", std::process::id(), settings.seed);
-    let driver = Driver::connect(&settings.driver, uuid, settings.max_wait).await;
-    let mut driver = driver.map_err(BridgeError::Driver)?;
+    let mut driver = Driver::connect(&settings.driver, uuid, settings.max_wait)
+        .await
+        .map_err(BridgeError::Driver)?;
 
     let options = ConnectOptions::with_token(settings.token.clone());
     let mut client = Client::connect_with(&settings.server, "wildcity-egodriver", &options).await?;
@@ -217,7 +218,7 @@ async fn recorded_drive(
     Ok(drive)
 }
 
-/// `http://HOST:PORT` of `ws://HOST:PORT/v1/session`.
+/// `http://HOST:PORT` of the server whose WebSocket is `ws://HOST:PORT/v1/session`.
 fn http_address(server: &str) -> String {
     let address = server.trim_end_matches("/v1/session");
     // The `s` of `wss` stays, so that it becomes `https`.
@@ -270,7 +271,8 @@ fn recorded_speed_m_s(drive: &Drive, settings: &EpisodeSettings) -> f64 {
     let after = drive.poses.iter().position(is_after).unwrap_or(0);
     // The pose before it must exist: a start at the first pose takes the first segment.
     let after = after.clamp(1, drive.poses.len() - 1);
-    let [from, to] = [&drive.poses[after - 1], &drive.poses[after]];
+    let from = &drive.poses[after - 1];
+    let to = &drive.poses[after];
     (to.station_m - from.station_m) / (1e-6 * (to.time_us - from.time_us) as f64)
 }
 

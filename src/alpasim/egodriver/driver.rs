@@ -71,9 +71,9 @@ impl Driver {
         let origin: Uri = format!("http://{address}").parse().map_err(no_address)?;
         // The wait for the first connection is longer than that for an answer: the network is
         // loaded then.
-        let channel = Channel::connect(address, limits::DRIVER_START).await;
-        let channel =
-            channel.map_err(|reason| DriverError::Lost(format!("{address}: {reason}")))?;
+        let channel = Channel::connect(address, limits::DRIVER_START)
+            .await
+            .map_err(|reason| DriverError::Lost(format!("{address}: {reason}")))?;
         let mut driver = Self { grpc: Grpc::with_origin(channel, origin), uuid, max_wait };
         let version: common::VersionId = driver.call("get_version", common::Empty {}).await?;
         tracing::info!(driver = version.version_id, "connected");
@@ -85,7 +85,6 @@ impl Driver {
         self.uuid.clone()
     }
 
-    /// Begins a session.
     pub(super) async fn start_session(
         &mut self,
         request: wire::DriveSessionRequest,
@@ -93,13 +92,11 @@ impl Driver {
         self.call::<_, wire::SessionRequestStatus>("start_session", request).await.map(drop)
     }
 
-    /// Ends the session.
     pub(super) async fn close_session(&mut self) -> Result<(), DriverError> {
         let request = wire::DriveSessionCloseRequest { session_uuid: self.uuid() };
         self.call::<_, common::Empty>("close_session", request).await.map(drop)
     }
 
-    /// Sends an image.
     pub(super) async fn submit_image(
         &mut self,
         image: wire::CameraImage,

@@ -32,8 +32,9 @@ pub(super) fn trajectory(
             return Err(DriverError::Plan(text));
         }
         last_us = at.timestamp_us;
-        let pose = frame.world_from("pose", at.pose.as_ref());
-        let pose = pose.map_err(|error| DriverError::Plan(format!("at {last_us} us: {error}")))?;
+        let pose = frame
+            .world_from("pose", at.pose.as_ref())
+            .map_err(|error| DriverError::Plan(format!("at {last_us} us: {error}")))?;
         let in_rig = rig_from_world * pose;
         // Not negative, because the filter keeps later poses only.
         let time_us = i64::try_from(last_us - now_us).unwrap_or(i64::MAX);

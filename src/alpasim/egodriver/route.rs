@@ -47,7 +47,8 @@ impl Route {
             .map(|station_m| {
                 // From the world to the rig in the plane: x is along `forward`, and y along `left`.
                 let offset = self.at(station_m) - ego;
-                let [x, y] = [offset.dot(forward) as f32, offset.dot(left) as f32];
+                let x = offset.dot(forward) as f32;
+                let y = offset.dot(left) as f32;
                 Vec3 { x, y, z: 0.0 }
             })
             .collect()
@@ -83,7 +84,8 @@ impl Route {
         // segment for stations outside, which the line below then extends. A drive has two points
         // or more.
         let after = self.stations_m.partition_point(|&s_m| s_m < station_m).clamp(1, last);
-        let [from, to] = [self.points[after - 1], self.points[after]];
+        let from = self.points[after - 1];
+        let to = self.points[after];
         let length_m = self.stations_m[after] - self.stations_m[after - 1];
         from + (to - from) * ((station_m - self.stations_m[after - 1]) / length_m.max(1e-9))
     }

@@ -42,8 +42,9 @@ pub(crate) async fn ground_intersection(
         let drives = &scene.resident.version.manifest.trajectories;
         answer(drives, &scene.frame, &asked)
     };
-    let answered = tokio::task::spawn_blocking(work).await;
-    let answered = answered.map_err(|error| Status::internal(error.to_string()))?;
+    let answered = tokio::task::spawn_blocking(work)
+        .await
+        .map_err(|error| Status::internal(error.to_string()))?;
     Ok(answered?)
 }
 
@@ -187,7 +188,8 @@ mod tests {
         let poses = answered.ego_trajectory_aabb.unwrap().poses;
         assert_eq!(poses.iter().map(|at| at.timestamp_us).collect::<Vec<_>>(), [8, 9]);
         assert_eq!((height(poses[0].pose), height(poses[1].pose)), (2.5, 9.0));
-        let [good, high] = [wire::Status::SuccessfulUpdate, wire::Status::HighTranslation];
+        let good = wire::Status::SuccessfulUpdate;
+        let high = wire::Status::HighTranslation;
         assert_eq!(answered.ego_status, [i32::from(good), i32::from(high)]);
     }
 

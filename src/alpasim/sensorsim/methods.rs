@@ -31,7 +31,8 @@ pub(super) struct Sensorsim {
 
 impl Sensorsim {
     pub(super) fn new(engine: Arc<Engine>, stopping: watch::Receiver<bool>) -> Self {
-        let (open, assets) = (OpenVersions::default(), Arc::default());
+        let open = OpenVersions::default();
+        let assets = Arc::default();
         let physics = Arc::new(Semaphore::new(limits::PHYSICS_REQUESTS));
         Self { engine, open, assets, physics, stopping }
     }
@@ -141,7 +142,7 @@ impl Sensorsim {
         Ok(wire::AvailableEgoMasksReturn { ego_mask_metadata })
     }
 
-    /// One image.
+    /// One image of one camera, as a batch of one.
     pub(super) async fn render_rgb(
         &self,
         asked: wire::RgbRenderRequest,

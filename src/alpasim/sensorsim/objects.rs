@@ -75,7 +75,8 @@ impl ObjectAssets {
             return Ok(Vec::new());
         }
         let shapes: Vec<ObjectShape> = objects.iter().map(|object| object.shape.clone()).collect();
-        let (own, engine) = (self.clone(), engine.clone());
+        let own = self.clone();
+        let engine = engine.clone();
         // Assets may be read from disk or made, neither of which an async thread must do.
         let read = tokio::task::spawn_blocking(move || own.assets(&engine, &shapes));
         let assets = read.await.map_err(|_| SessionError::Crashed)??;
@@ -127,8 +128,7 @@ impl ObjectAssets {
         if let Some(asset) = self.known(key) {
             return Ok(asset);
         }
-        let made = shape.box_asset();
-        let made = made.map_err(|error| SensorsimError::Invalid(error.to_string()))?;
+        let made = shape.box_asset().map_err(|error| SensorsimError::Invalid(error.to_string()))?;
         if let Some(box_asset) = made {
             return self.load(key, || engine.hold_actor(key, box_asset.clone()));
         }
@@ -166,8 +166,8 @@ impl ObjectAssets {
         // The oldest leaves. 384 entries are searched in microseconds, so no list in order of use
         // is kept.
         if !known.contains_key(key) && known.len() >= limits::OBJECT_ASSETS {
-            let oldest = known.iter().min_by_key(|(_, (_, drawn))| *drawn);
-            let oldest = oldest.map(|(key, _)| key.clone());
+            let oldest =
+                known.iter().min_by_key(|(_, (_, drawn))| *drawn).map(|(key, _)| key.clone());
             oldest.and_then(|key| known.remove(&key));
         }
         known.insert(key.to_owned(), (asset.clone(), Instant::now()));

@@ -44,8 +44,10 @@ impl OpenVersions {
         // Held while memory is reserved, so that simultaneous requests reserve it once.
         let mut open = self.versions.lock().await;
         if !open.contains_key(&key) && open.len() >= limits::OPEN_SCENES {
-            let oldest = open.iter().min_by_key(|(_, version)| version.last_drawn());
-            let oldest = oldest.map(|(key, _)| key.clone());
+            let oldest = open
+                .iter()
+                .min_by_key(|(_, version)| version.last_drawn())
+                .map(|(key, _)| key.clone());
             oldest.and_then(|key| open.remove(&key));
         }
         // Taken out, so that its reservation can be dropped before the larger one is made.

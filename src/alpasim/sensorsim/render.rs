@@ -107,8 +107,12 @@ impl OpenScene {
 
 /// The cameras that a scene of a twin offers: those of the twin's rig, then those of a preset.
 pub fn offered_cameras(manifest: &Manifest) -> Vec<RigCamera> {
-    let own = manifest.rig.clone().or_else(|| Rig::preset(RIG));
-    let own = own.map(|rig| rig.cameras).unwrap_or_default();
+    let own = manifest
+        .rig
+        .clone()
+        .or_else(|| Rig::preset(RIG))
+        .map(|rig| rig.cameras)
+        .unwrap_or_default();
     with_preset(&own, Rig::preset(OFFERED).map(|rig| rig.cameras).unwrap_or_default())
 }
 

@@ -121,7 +121,8 @@ mod tests {
     fn each_error_has_its_status() {
         let session = |error: SessionError| SensorsimError::from(error);
         let residency = |error: ResidencyError| session(error.into());
-        let (twin, text) = (String::from("demo"), String::from("sedan"));
+        let twin = String::from("demo");
+        let text = String::from("sedan");
         let no_room = ResidencyError::NoRoom {
             twin: twin.clone(),
             needed_bytes: 2,

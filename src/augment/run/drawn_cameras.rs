@@ -15,8 +15,12 @@ pub(super) fn cameras(
     side_px: Option<u32>,
     lenses: bool,
 ) -> anyhow::Result<Vec<TrainingCamera>> {
-    let rig = version.manifest.rig.clone().or_else(|| Rig::preset(wildcity_session::limits::RIG));
-    let rig = rig.context("the twin has no rig: `wildcity twin drive` gives it one")?;
+    let rig = version
+        .manifest
+        .rig
+        .clone()
+        .or_else(|| Rig::preset(wildcity_session::limits::RIG))
+        .context("the twin has no rig: `wildcity twin drive` gives it one")?;
     let known: Vec<&str> = rig.cameras.iter().map(|camera| &*camera.name).collect();
     let unknown = named.iter().find(|name| !known.contains(&&***name));
     if let Some(unknown) = unknown {

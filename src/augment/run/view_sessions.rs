@@ -26,11 +26,11 @@ pub(super) struct ViewSessions {
 
 /// One image with its maps.
 pub(super) struct Drawn {
-    /// `[height, width, 3]`.
+    /// Red, green and blue of 8 bits, `[height, width, 3]`.
     pub(super) rendered: Vec<u8>,
     /// The same after the repair, or as rendered if it was not repaired; `None` without a model.
     pub(super) repaired: Option<Vec<u8>>,
-    /// `[height, width]`.
+    /// Accumulated opacity from 0 to 1, `[height, width]`.
     pub(super) opacity: Vec<f32>,
     pub(super) depth_m: Vec<f32>,
     pub(super) trust: f64,
@@ -120,13 +120,14 @@ impl ViewSessions {
                 (plain?, Some(repaired?))
             }
         };
-        let drawn =
-            plain.images().enumerate().map(|(at, image)| drawn(image, repaired.as_ref(), at));
-        let drawn = drawn.collect::<anyhow::Result<Vec<Drawn>>>();
+        let drawn = plain
+            .images()
+            .enumerate()
+            .map(|(at, image)| drawn(image, repaired.as_ref(), at))
+            .collect::<anyhow::Result<Vec<Drawn>>>();
         drawn.with_context(|| format!("{} at {} m", place.trajectory, place.station_m))
     }
 
-    /// Ends the sessions.
     pub(super) async fn close(mut self) -> anyhow::Result<()> {
         self.plain.close().await?;
         if let Some(mut repaired) = self.repaired {

@@ -105,6 +105,7 @@ impl Actors {
                 engine.backend()
             )?;
         }
+        // 0 draws full detail in both, so that they have the same Gaussians.
         for tau_px in [0.0, version.manifest.profile.tau_px] {
             let row = runtime.block_on(self.measure(&engine, &cars, tau_px))?;
             self.print(&row, &mut out)?;
@@ -228,6 +229,7 @@ impl Times {
     /// The median time of each stage.
     fn stages(&self) -> Vec<(&'static str, f64)> {
         let first = self.stages_ms.first().into_iter().flatten();
+        // A renderer reports the same stages in the same order with every frame.
         let of = |index: usize| self.stages_ms.iter().map(move |stages| stages[index].1);
         first.enumerate().map(|(index, (name, _))| (*name, median(of(index)))).collect()
     }

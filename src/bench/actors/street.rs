@@ -33,7 +33,6 @@ const HALF: [f64; 2] = [0.5, 0.25 / 0.66];
 
 /// The cars, and the drive between them.
 pub(super) struct Cars {
-    /// The vehicle's cameras.
     pub(super) rig: Rig,
     drive: Trajectory,
     asset: String,
@@ -49,14 +48,18 @@ pub(super) fn commit(
     into: &Catalog,
 ) -> anyhow::Result<Cars> {
     let manifest = &version.manifest;
-    let drive = manifest.trajectories.first();
-    let drive = drive.with_context(|| format!("twin {:?} has no trajectory", manifest.twin))?;
+    let drive = manifest
+        .trajectories
+        .first()
+        .with_context(|| format!("twin {:?} has no trajectory", manifest.twin))?;
     let places = places(drive, count).with_context(|| format!("twin {:?}", manifest.twin))?;
     let rig = manifest.rig.clone().or_else(|| Rig::preset(wildcity_session::limits::RIG));
 
     // The car.
-    let model = actor_models().into_iter().find(|model| model.name == "sedan");
-    let model = model.context("there is no generated sedan")?;
+    let model = actor_models()
+        .into_iter()
+        .find(|model| model.name == "sedan")
+        .context("there is no generated sedan")?;
     let car = refined(model.gaussians, gaussians as usize);
     let provenance = Provenance::new(format!("sedan of {} Gaussians", car.len()));
     let description = AssetDescription {
@@ -65,8 +68,8 @@ pub(super) fn commit(
         box_: model.box_,
         provenance: provenance.clone(),
     };
-    let asset = ActorAsset::new(&car, description)?;
-    let asset = into.put_actor(&asset, manifest.record)?.hash;
+    let made = ActorAsset::new(&car, description)?;
+    let asset = into.put_actor(&made, manifest.record)?.hash;
 
     // The twins.
     let mut all = Gaussians { sh_degree: manifest.sh_degree, ..Gaussians::default() };
@@ -116,6 +119,7 @@ impl Cars {
 /// oncoming lane.
 fn places(drive: &Trajectory, count: u32) -> anyhow::Result<Vec<Pose>> {
     let rows = count.div_ceil(2);
+    // The row in the ego's lane has a gap around the middle, of FREE_M to both sides.
     let needed_m = f64::from(rows) * SPACING_M + 2.0 * FREE_M;
     let length_m = drive.length_m();
     anyhow::ensure!(
@@ -125,6 +129,7 @@ fn places(drive: &Trajectory, count: u32) -> anyhow::Result<Vec<Pose>> {
     let place = |index: u32| {
         let from_middle_m = (f64::from(index / 2) - 0.5 * f64::from(rows - 1)) * SPACING_M;
         let from_ahead = index % 2 == 1;
+        // Away from the middle, where the ego drives.
         let free_m = if from_ahead { 0.0 } else { FREE_M.copysign(from_middle_m) };
         let station_m = 0.5 * length_m + from_middle_m + free_m;
         let beside = if from_ahead {
@@ -165,6 +170,7 @@ fn halve(gaussians: &mut Gaussians, index: usize) {
     let rotation = DQuat::from_xyzw(x, y, z, w).normalize();
     let [share, beside] = HALF;
     let along_m = rotation * DVec3::AXES[axis] * (beside * f64::from(scales[axis]).exp());
+    // Scales are stored as logarithms: a product becomes a sum.
     gaussians.ln_scales[index][axis] += share.ln() as f32;
     let middle_m = DVec3::from_array(gaussians.means_m[index]);
     let one = gaussians.select([index]);

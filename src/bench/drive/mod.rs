@@ -90,9 +90,10 @@ impl Drive {
         engine: Arc<wildcity_session::Engine>,
         manifest: &Manifest,
     ) -> anyhow::Result<Report> {
-        let trajectory = manifest.trajectories.first();
-        let trajectory =
-            trajectory.with_context(|| format!("twin {:?} has no trajectory", manifest.twin))?;
+        let trajectory = manifest
+            .trajectories
+            .first()
+            .with_context(|| format!("twin {:?} has no trajectory", manifest.twin))?;
         let route = Route::new(trajectory)?;
 
         // Open the session, and render the first frame.
@@ -154,8 +155,11 @@ impl Drive {
     }
 
     fn opening(&self, manifest: &Manifest) -> Open {
-        let rig = manifest.rig.clone().or_else(|| Rig::preset(wildcity_session::limits::RIG));
-        let rig = rig.map(|rig| cropped(rig, self.crop));
+        let rig = manifest
+            .rig
+            .clone()
+            .or_else(|| Rig::preset(wildcity_session::limits::RIG))
+            .map(|rig| cropped(rig, self.crop));
         let outputs = Outputs::default();
         Open { rig: rig.map(|rig| RigChoice::Full(rig.into())), ..self.twin.session(outputs) }
     }

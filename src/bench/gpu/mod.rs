@@ -118,10 +118,12 @@ impl Gpu {
         while warm_up.elapsed() < WARM_UP_TIME {
             time(device, &frame, 1, "gpu")?;
         }
+        // Some counters only grow: what the warm-up has added to them is subtracted below.
         let before = usage()?;
         let own = time(device, &frame, self.repeat, "gpu")?;
         let usage = usage()?;
         let cpu = cpu.map(|cpu| {
+            // The second of warm-up is for the clock of a graphics card: here two frames suffice.
             time(cpu, &frame, WARM_UP, "cpu")?;
             time(cpu, &frame, self.repeat, "cpu")
         });
@@ -158,6 +160,7 @@ fn stages(own: &Timed, counts: &FrameCounts, roofline: &Roofline) -> Vec<StageRe
     let bytes = counts.stage_bytes().into_iter();
     let stages = bytes.filter_map(|(stage, bytes)| {
         let device_ms = own.stats.stages_ms.iter().find(|(name, _)| *name == stage)?.1;
+        // Of the other stages only the traffic is estimated.
         let operations = if stage == "rasterize" { counts.rasterize_operations() } else { 0 };
         Some(StageReport::new(stage, device_ms, bytes, operations, roofline))
     });
@@ -167,6 +170,7 @@ fn stages(own: &Timed, counts: &FrameCounts, roofline: &Roofline) -> Vec<StageRe
 /// Host times: those that the host measured, then the rest of the step.
 fn host(own: &Timed, counts: &FrameCounts, stages: &[StageReport]) -> Vec<(&'static str, f64)> {
     let bytes = counts.stage_bytes();
+    // A stage without a count of bytes is not one of the device.
     let is_host = |name: &str| bytes.iter().all(|(stage, _)| *stage != name);
     let timed = own.stats.stages_ms.iter().filter(|(name, _)| is_host(name));
     let mut host_ms: Vec<(&'static str, f64)> = timed.copied().collect();

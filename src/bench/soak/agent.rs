@@ -19,7 +19,6 @@ pub(super) struct Driven {
     pub(super) rounds: u64,
 }
 
-/// One session's agent.
 pub(super) struct Agent {
     pub(super) url: String,
     pub(super) twin: String,
@@ -45,6 +44,7 @@ impl Agent {
             let version = Some(self.version);
             client.open(Open { rig, version, ..Open::twin(&self.twin) }).await?;
             for step in 0..=self.steps {
+                // A round may take longer than the rest of the time.
                 if Instant::now() >= self.until {
                     break;
                 }
@@ -54,6 +54,8 @@ impl Agent {
                 };
                 seen.verify()?;
                 let hash = seen.metadata().frame_hash.clone();
+                // The same step of every round shows the same pose of the same version: images must
+                // be equal to the bit, whatever is pushed meanwhile.
                 let known = first.entry(step).or_insert_with(|| hash.clone());
                 anyhow::ensure!(
                     *known == hash,
@@ -71,7 +73,9 @@ impl Agent {
 
     /// Each session drives another part of the route.
     fn pose(&self, step: u32) -> Pose {
+        // A remainder of a division by 0 would be NaN.
         let length_m = self.route.length_m().max(f64::MIN_POSITIVE);
+        // A share that is no simple fraction: few sessions meet at one place.
         let from_m = f64::from(self.number) * 0.37 * length_m;
         let station_m = (from_m + f64::from(step) * 0.1 * SPEED_M_PER_S) % length_m;
         let pose = self.route.at_station(station_m);

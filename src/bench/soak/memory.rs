@@ -13,7 +13,7 @@ pub(super) struct Memory {
     windows: [Vec<u64>; WINDOWS],
 }
 
-/// How memory changed.
+/// Memory at the beginning of a soak, later, and at most.
 #[derive(Debug, PartialEq)]
 pub(super) struct Growth {
     /// Median of the window after the first, in bytes.

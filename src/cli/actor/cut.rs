@@ -175,10 +175,12 @@ pub(in crate::cli) fn swept(file: &TracksFile) -> anyhow::Result<Vec<(CutPlace, 
         let track = section.shifted(0)?;
         let place = |world_from_box: Pose| (CutPlace { world_from_box, box_ }, section.class);
         for pair in track.keyframes().windows(2) {
-            let [from, to] = [pair[0].world_from_actor, pair[1].world_from_actor];
+            let from = pair[0].world_from_actor;
+            let to = pair[1].world_from_actor;
             // The corners also move as the box turns.
             let turned_m = 0.5 * length_m.hypot(width_m) * from.rotation.angle_between(to.rotation);
             let moved_m = from.position_m.distance(to.position_m) + turned_m;
+            // A track that stands still has one place for each pair, so that its box is cut, too.
             let count = (moved_m / SWEEP_STEP_M).ceil().max(1.0) as usize;
             anyhow::ensure!(
                 places.len() + count <= SWEEP_PLACES,
@@ -187,6 +189,7 @@ pub(in crate::cli) fn swept(file: &TracksFile) -> anyhow::Result<Vec<(CutPlace, 
             places
                 .extend((0..count).map(|k| place(from.interpolate(&to, k as f64 / count as f64))));
         }
+        // Each pair leaves its end out, which is the beginning of the next one.
         places.extend(track.keyframes().last().map(|last| place(last.world_from_actor)));
     }
     Ok(places)

@@ -73,6 +73,7 @@ impl Import {
         let read = read_actor(&self.source, &axes, settings.mesh_gaussians, show);
         let SourceScene { gaussians, hash, options, mut notes, .. } = read.with_context(cannot)?;
         bar.finish_and_clear();
+        // The note would speak of a profile, which an actor does not have.
         if let Some(Antialiasing { blur_px2: Some(_), said_by }) = notes.antialiasing.take() {
             notes
                 .warnings
@@ -102,8 +103,10 @@ impl Import {
             let name = name_from(&format!("{}-{track}", settings.name));
             let of_track = || format!("track {track:?} of {}", self.source.display());
             let Bounds { min_m, max_m } = ActorAsset::bounds(&gaussians);
+            // The origin of an actor is on the ground: its lowest point gets the height 0.
             let down_m = DVec3::new(0.0, 0.0, -min_m.z);
             gaussians.transform(&Pose { position_m: down_m, ..Pose::IDENTITY });
+            // A box of an actor is centred on its origin, and has to reach both ends.
             let half_m = min_m.abs().max(max_m.abs());
             let box_ = ActorBox {
                 length_m: 2.0 * half_m.x,

@@ -39,10 +39,12 @@ impl CarefulDriver {
         let world_from_rig = Pose::checked(seen.ego.pose.xyz, seen.ego.pose.q)?;
         let mut station_m = self.course.nearest(world_from_rig.position_m).station_m;
         let velocity_mps = DVec3::from_array(seen.ego.velocity);
+        // Along the heading: a car that slides sideways or rolls back has no speed for the model.
         let mut speed_mps = velocity_mps.dot(world_from_rig.rotation * DVec3::X).max(0.0);
         let free = Idm::WILDCITY.acceleration(speed_mps, 0.0, f64::INFINITY);
         let behind = Idm { braking_mps2: BRAKING_MPS2, ..Idm::WILDCITY };
         let actors = seen.actors.iter().flatten();
+        // The actor that asks for the hardest braking decides.
         let acceleration = actors.fold(free, |least: f64, actor| {
             let beside = self.course.nearest(DVec3::from_array(actor.pose.xyz));
             let gap_m = beside.station_m - 0.5 * actor.size[0] - station_m - FRONT_M;
@@ -58,6 +60,7 @@ impl CarefulDriver {
             let [way_m, next_mps] = rolled(speed_mps, acceleration, PLAN_STEP_US as f64 * 1e-6);
             station_m += way_m;
             speed_mps = next_mps;
+            // Poses of a plan are relative to the rig at the time of the observation.
             let pose = rig_from_world * self.course.at(station_m);
             TimedPose { time_us: k * PLAN_STEP_US, pose: wire_pose(&pose) }
         });

@@ -137,8 +137,10 @@ impl Demo {
             demo_twin(&twins, SPOILED_TWIN, StorageOptions::default(), Some(SPOILED_BY))?;
         }
         // Uploads are needed until they are pushed, and the viewer of --view pushes some.
-        let uploads = tempfile::Builder::new().prefix(".uploads").tempdir_in(&self.out);
-        let uploads = uploads.with_context(|| format!("cannot write to {}", self.out.display()))?;
+        let uploads = tempfile::Builder::new()
+            .prefix(".uploads")
+            .tempdir_in(&self.out)
+            .with_context(|| format!("cannot write to {}", self.out.display()))?;
         let directories = Directories {
             twins,
             episodes: self.out.join("episodes"),
@@ -251,6 +253,7 @@ impl Demo {
             let start = Instant::now();
             seen = client.drive(movement, false).await?;
             let step_ms = start.elapsed().as_secs_f64() * 1e3;
+            // Outside of the time that is measured: hashing is work of the demo and not of a step.
             seen.verify()?;
             drive.steps.push(step_report(&seen, step_ms));
             drive.events.extend(seen.metadata().events.iter().cloned());
@@ -269,6 +272,7 @@ impl Demo {
         let step_ms = |step: &serde_json::Value| step["step_ms"].as_f64().unwrap_or(f64::NAN);
         let mut steps_ms: Vec<f64> = drive.steps.iter().map(step_ms).collect();
         steps_ms.sort_by(f64::total_cmp);
+        // At least one step was driven, or an error has ended the demo.
         let last = (steps_ms.len() - 1) as f64;
         let quantile_ms = |share: f64| steps_ms[(last * share).round() as usize];
         let mut report = json!({
@@ -369,6 +373,7 @@ fn demo_twin(
     let settings_json = serde_json::to_string(&settings)?;
     let spoiled = spoil.map_or(String::new(), |amount| format!(", spoiled by {amount}"));
     let provenance = Provenance::new(format!("{STREET}{revision}: {settings_json}{spoiled}"));
+    // The provenance has all settings: a twin of another build or amount is made anew.
     let reason = match existing(&catalog, name, &provenance)? {
         Existing::Usable(version) => return Ok(*version),
         Existing::Rebuild(reason) => reason,
@@ -429,6 +434,7 @@ fn existing(catalog: &Catalog, name: &str, provenance: &Provenance) -> anyhow::R
     };
     let found = &version.manifest.provenance;
     anyhow::ensure!(
+        // A twin of the user with the same name must not be replaced.
         found.source.starts_with(STREET),
         "twin {name:?} in {} is not the demo street (its source is {:?}): give another directory with \
          --twins, or import that twin under another name",

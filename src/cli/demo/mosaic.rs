@@ -80,6 +80,7 @@ fn fit(image: &ImageView<'_>) -> anyhow::Result<RgbImage> {
     let height = u32::try_from(metadata.height)?;
     let rgb = RgbImage::from_raw(width, height, image.rgb()?.into_owned())
         .context("the image does not have the size that its metadata says")?;
+    // Images of the rig differ in shape: they get one width, so that columns line up.
     let scaled = (f64::from(WIDTH_PX) / f64::from(width) * f64::from(height)) as u32;
     Ok(imageops::resize(&rgb, WIDTH_PX, scaled.max(1), FilterType::Triangle))
 }

@@ -14,7 +14,6 @@ pub(super) enum DemoScenario {
 }
 
 impl DemoScenario {
-    /// Its file.
     fn text(self) -> &'static str {
         match self {
             Self::CutIn => include_str!("../../../scenes/cut-in.json"),
@@ -38,6 +37,7 @@ impl DemoScenario {
         for actor in actors.into_iter().flatten() {
             let name = actor["asset"].as_str().unwrap_or_default();
             if let Some(asset) = assets.iter().find(|asset| asset.description.name == name) {
+                // By hash, because a catalog may have several assets of one name.
                 actor["asset"] = asset.hash.clone().into();
             }
         }

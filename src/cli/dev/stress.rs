@@ -73,8 +73,11 @@ impl BackendName {
 
 impl Stress {
     pub(super) fn run(self) -> anyhow::Result<()> {
-        let backends = self.backends.iter().map(|name| candidate(*name, &self.hardware));
-        let backends = backends.collect::<anyhow::Result<Vec<Candidate>>>()?;
+        let backends = self
+            .backends
+            .iter()
+            .map(|name| candidate(*name, &self.hardware))
+            .collect::<anyhow::Result<Vec<Candidate>>>()?;
         let all = || CASES.iter().collect();
         let cases = if self.cases.is_empty() { all() } else { self.cases };
         let bar = progress::state();
@@ -106,6 +109,8 @@ pub(in crate::cli) fn candidate(
         BackendName::Cpu => Ok(Box::new(hardware.cpu()?)),
         BackendName::Gpu => match hardware.gpu() {
             Ok(gpu) => Ok(Box::new(gpu)),
+            // A machine without a GPU still tests the other backends: the table names what is
+            // missing.
             Err(error) => Err(("gpu", error.to_string())),
         },
     })

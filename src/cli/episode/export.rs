@@ -91,6 +91,7 @@ impl Export {
         let path = super::find_record(&self.episode, &self.episodes)?;
         let target = self.target()?;
         let is_record = target
+            // A target that does not exist yet has no canonical path, and is not the record.
             .canonicalize()
             .is_ok_and(|target| path.canonicalize().is_ok_and(|record| record == target));
         anyhow::ensure!(
@@ -151,8 +152,11 @@ impl Export {
         let rig = EpisodeFile::rig(path)?;
         let mut recording = RecordedEpisode::read(path)?;
         let count = recording.header.rig.cameras.len();
-        let wanted = self.camera.iter().map(|name| camera_index(&recording, name));
-        let mut wanted = wanted.collect::<anyhow::Result<Vec<usize>>>()?;
+        let mut wanted = self
+            .camera
+            .iter()
+            .map(|name| camera_index(&recording, name))
+            .collect::<anyhow::Result<Vec<usize>>>()?;
         if wanted.is_empty() && self.images {
             wanted = (0..count).collect();
         }

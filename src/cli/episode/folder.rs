@@ -40,6 +40,7 @@ pub(super) fn runs_in(dir: &Path) -> Vec<PathBuf> {
     let records = entries.map(|entry| entry.path().join(EPISODES));
     let mut found: Vec<PathBuf> = records.filter(|records| records.is_dir()).collect();
     found.sort();
+    // Sorted before, so that the same ones are named each time.
     found.truncate(NAMED);
     found
 }

@@ -18,13 +18,16 @@ pub(super) fn camera_index(recording: &RecordedEpisode, wanted: &str) -> anyhow:
 /// poses.
 pub(super) fn keep_cameras(frame: &mut FrameRecord, kept_cameras: &[usize], rig_cameras: usize) {
     let is_driven = matches!(frame.request, FrameRequest::Reset | FrameRequest::Step);
+    // In the order of the poses and of the cameras that are due at each: every entry has to be
+    // taken in turn, kept or not.
     let mut images = std::mem::take(&mut frame.images).into_iter();
     let mut repairs = std::mem::take(&mut frame.repairs).into_iter();
     let mut cameras = Vec::new();
     for pose in 0..frame.poses.len() {
         let mut of_pose = Vec::new();
         for rendered in frame.due_cameras(pose, rig_cameras) {
-            let (image, repair) = (images.next(), repairs.next());
+            let image = images.next();
+            let repair = repairs.next();
             if kept_cameras.contains(&rendered) && is_driven {
                 of_pose.push(rendered);
                 frame.images.extend(image);

@@ -49,6 +49,7 @@ impl List {
             "{:<32} {:<20} {:>12}  {:<14} scenario, verdict",
             "record", "twin", "", "end"
         )?;
+        // Only what is printed is read: a record may be large.
         for one in listed.iter().take(self.most) {
             let text = match EpisodeFile::read(&one.path) {
                 Ok(episode) => line(&episode),

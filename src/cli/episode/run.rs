@@ -139,13 +139,13 @@ impl Run {
             .map_err(|reason| bad_input(format!("--accept-unjudged: {reason}")))?;
         let accept_unjudged =
             [suite.accept_unjudged.clone(), self.accept_unjudged.clone()].concat();
-        let agent = self.agent.clone().or(suite.agent.clone()).unwrap_or("log".to_owned());
-        let agent = choice(&agent)?;
+        let named = self.agent.clone().or(suite.agent.clone()).unwrap_or("log".to_owned());
+        let agent = choice(&named)?;
         let catalog = self.twins.catalog()?;
         let options = CaseOptions { latest: self.latest, bare: self.bare };
         let cases = cases(&suite, &scenarios, &catalog, options).map_err(bad_input)?;
-        let before = self.against.as_deref().map(SuiteResult::read).transpose();
-        let before = before.map_err(bad_input)?;
+        let before =
+            self.against.as_deref().map(SuiteResult::read).transpose().map_err(bad_input)?;
         let rule: Rule = self.worse_by.iter().cloned().collect();
         if let Some(before) = &before {
             Comparison::check(before, &cases, &rule).map_err(bad_input)?;
@@ -178,7 +178,8 @@ impl Run {
             progress: Box::new(move |episode: &EpisodeEntry| {
                 counted.inc(1);
                 let status = episode.status.name();
-                let (done, all) = (counted.position(), counted.length().unwrap_or(0));
+                let done = counted.position();
+                let all = counted.length().unwrap_or(0);
                 let seconds = begun.elapsed().as_secs_f64();
                 counted.suspend(|| {
                     eprintln!("{done}/{all} after {seconds:.0} s: {status} {}", episode.name);

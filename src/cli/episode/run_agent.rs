@@ -44,6 +44,7 @@ pub(super) fn choice(agent: &str) -> anyhow::Result<AgentChoice> {
 
 /// Checks that an address is HOST:PORT, without characters that have a meaning in a shell.
 fn check_address(address: &str) -> Result<(), &'static str> {
+    // The address becomes a part of a shell's command line, within quotes.
     let is_allowed = |c: char| c.is_ascii_alphanumeric() || "-._:[]".contains(c);
     if !address.chars().all(is_allowed) {
         return Err("an address has only letters, digits and -._:[]");

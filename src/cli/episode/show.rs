@@ -101,6 +101,7 @@ fn named(episode: &EpisodeFile, actor: &str, trigger: u32) -> String {
 }
 
 fn text(event: &Event, episode: &EpisodeFile) -> String {
+    // An index of a damaged record may be of no actor: then the number is shown.
     let name = |index: u16| {
         let actors = episode.scenario.as_ref().map_or(&[][..], |scenario| &scenario.actors);
         actors.get(usize::from(index)).map_or(index.to_string(), |actor| actor.name.clone())

@@ -84,6 +84,7 @@ impl Video {
             writeln!(out, "differs     {difference}")?;
         }
         let size = &header.rig.cameras[camera].camera;
+        // yuv420p has half the colour in both directions, and so needs even sides.
         let is_odd = size.width_px % 2 == 1 || size.height_px % 2 == 1;
         writeln!(
             out,

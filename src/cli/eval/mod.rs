@@ -130,6 +130,7 @@ const LOG_EVERY: u32 = 8;
 
 /// The files of `--boxes` and `--lidar` that a log stands for.
 fn log_labels(log: &Log) -> anyhow::Result<(Option<PathBuf>, Option<PathBuf>)> {
+    // Opening a table tells whether the log has it; its rows are read later.
     let boxes = log.tracks()?.map(|_| log.path(TrackRow::FILE));
     let lidar = log.sweeps()?.map(|_| log.folder().to_owned());
     Ok((boxes, lidar))
@@ -174,6 +175,7 @@ impl Eval {
             output::write(&path, png)
         };
         let save: Option<Save<'_>> = self.save_images.then_some(&save);
+        // Before the folder is made: mistakes in the inputs leave nothing behind.
         let evaluator = Evaluator::new(&settings, scene, &list, save)?;
         output::create_dir(&self.out)?;
         let bar = progress::count("comparing");

@@ -90,6 +90,7 @@ impl std::str::FromStr for Offsets {
         };
         let offset = |text: &str| text.trim().parse::<f64>().map_err(|_| must());
         let offsets = text.split(',').map(offset).collect::<Result<Vec<f64>, String>>()?;
+        // NaN fails the second comparison.
         let is_offset = |offset: &f64| *offset != 0.0 && offset.abs() <= FARTHEST_M;
         if offsets.len() > MOST || !offsets.iter().all(is_offset) {
             return Err(must());

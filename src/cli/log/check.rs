@@ -48,6 +48,7 @@ impl Check {
         let bar = progress::count("comparing");
         let report = check(&log, &settings, &mut progress::show(&bar))?;
         bar.finish_and_clear();
+        // The page is written also if there are errors, because it shows where they are.
         output::write(&self.out, page(&report)?.as_bytes())?;
         let mut out = output::stdout();
         if self.json {

@@ -99,11 +99,14 @@ impl Export {
         out: &Path,
     ) -> anyhow::Result<String> {
         let cameras = training_cameras(&log.rig);
+        // Both files have one lens model for all cameras: some rigs cannot be written so, and still
+        // have a drive and lists.
         let model = match CameraModel::from_cameras(&cameras) {
             Ok(model) => model,
             Err(error) => return Ok(format!("no transforms.json and no COLMAP model: {error}")),
         };
         let mut trained = Vec::new();
+        // Held-out images are left out of the capture, or a training would see them.
         for image in images.iter().filter(|image| !image.row.held_out) {
             let name = linked(image, &out.join("images"))?;
             trained.push(TrainingImage {
@@ -213,6 +216,7 @@ fn linked(image: &PlacedImage, folder: &Path) -> anyhow::Result<String> {
     let name = format!("{}.{}", image.name, extension.unwrap_or("jpg"));
     let path = folder.join(&name);
     output::create_dir(path.parent().unwrap_or(folder))?;
+    // A link is resolved from its own folder, and not from the current one.
     let source = absolute(&image.file)?;
     let cannot = || format!("cannot write {}", path.display());
     #[cfg(unix)]

@@ -41,7 +41,9 @@ impl Count {
         let rows = counted(self.rows, "row");
         let Some([first_us, last_us]) = self.span_us else { return rows };
         let [first_s, last_s] = [first_us, last_us].map(|us| us as f64 / 1e6);
+        // There is one period less than rows.
         let steps = self.rows.saturating_sub(1) as f64;
+        // All rows of a table may have one time, such as those of several cameras.
         let rate = if last_s > first_s {
             format!(", {:.1} Hz", steps / (last_s - first_s))
         } else {

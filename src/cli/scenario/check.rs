@@ -67,7 +67,8 @@ fn looks(scenario: &Scenario, assets: &StoredAssets<'_>) -> Vec<String> {
             format!("{:.1} x {:.1} x {:.1} m", box_.length_m, box_.width_m, box_.height_m)
         };
         is_other.then(|| {
-            let (drawn, real) = (size(&own), size(box_));
+            let drawn = size(&own);
+            let real = size(box_);
             format!("actor {name:?} looks as if it had {drawn}, and has {real}: set its asset")
         })
     };
@@ -90,8 +91,10 @@ fn never_fire(scenario: &Scenario) -> Vec<String> {
             let Some(why) = never_holds(&trigger.when, line_m, scenario.end.time_us) else {
                 continue;
             };
-            let name = names.and_then(|names| names.get(at)).filter(|name| !name.is_empty());
-            let name = name.map_or(at.to_string(), |name| format!("{name:?}"));
+            let name = names
+                .and_then(|names| names.get(at))
+                .filter(|name| !name.is_empty())
+                .map_or(at.to_string(), |name| format!("{name:?}"));
             let actor = &actor.spec.name;
             texts.push(format!("trigger {name} of actor {actor:?} never fires: {why}"));
         }
@@ -112,8 +115,8 @@ fn never_holds(when: &Condition, line_m: f64, end_us: Option<i64>) -> Option<Str
         let text = format!("{field} is {station_m} m, and {line}");
         Some(format!("{text}; write within_m or time_s for an actor that crosses"))
     });
-    let late = when.time_us.zip(end_us).filter(|(time_us, end_us)| time_us > end_us);
-    let late = late.map(|(time_us, end_us)| {
+    let times_us = when.time_us.zip(end_us).filter(|(time_us, end_us)| time_us > end_us);
+    let late = times_us.map(|(time_us, end_us)| {
         let [time_s, end_s] = [time_us, end_us].map(|us| us as f64 * 1e-6);
         format!("time_s is {time_s}, and the scenario ends at {end_s} s")
     });

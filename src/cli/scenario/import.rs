@@ -131,7 +131,7 @@ fn openscenario_bytes() -> u64 {
     wildcity_convert::TEXT_BYTES as u64
 }
 
-/// NAME=VALUE.
+/// Parses a parameter of the scenario, as `NAME=VALUE`.
 fn parameter(text: &str) -> Result<(String, String), String> {
     let (name, value) = text.split_once('=').ok_or("expected NAME=VALUE, for example Speed=12")?;
     Ok((name.to_owned(), value.to_owned()))

@@ -69,11 +69,11 @@ fn opened(path: &Path, catalog: &Catalog) -> anyhow::Result<Opened> {
     let name = name_of(path)?;
     let document = scenarios.document(&ScenarioSource::Named(name)).with_context(context)?;
     let file = document.with(&document.first_values()).with_context(context)?;
-    let version = match &file.twin.version_hash {
+    let found = match &file.twin.version_hash {
         None => catalog.version(&file.twin.name, None),
         Some(hash) => find_version(catalog, &file.twin.name, hash),
     };
-    let version = version.with_context(context)?;
+    let version = found.with_context(context)?;
     Ok(Opened { scenarios, document, version })
 }
 

@@ -22,6 +22,7 @@ impl Serve {
     /// # Errors
     /// The file cannot be read, has an unknown key or a value that the option refuses.
     pub(in crate::cli) fn from_file(file: &Path) -> anyhow::Result<Self> {
+        // One argument with a sign of equality: a path that begins with a dash is no option then.
         let mut argument = OsString::from("--config=");
         argument.push(file);
         Ok(config_file::resolve(vec![argument])?.serve)
@@ -68,6 +69,7 @@ impl Serve {
         if self.tokens.is_none() && !listen.ip().is_loopback() {
             return Err(format!("{listen} is not a loopback address, and needs tokens"));
         }
+        // The listener is dropped at once, and the port is free again.
         match TcpListener::bind(listen) {
             Ok(_) => Ok(format!("{listen} is free")),
             Err(error) => Err(format!("{listen}: {error}; a server may run already")),
@@ -109,6 +111,7 @@ fn check_audit_log(path: &Path) -> Result<String, String> {
         OpenOptions::new().append(true).open(path).map(drop)
     } else {
         let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
+        // A file without a name tells whether the folder can be written, and leaves nothing there.
         tempfile::tempfile_in(folder.unwrap_or(Path::new("."))).map(drop)
     };
     match written {

@@ -31,7 +31,6 @@ const NOT_KEYS: [&str; 5] = ["config", "help", "open", "print_config", "twin"];
 /// The options of one run.
 #[derive(Debug)]
 pub(super) struct Resolved {
-    /// The options.
     pub(super) serve: Serve,
     matches: ArgMatches,
 }
@@ -41,10 +40,13 @@ pub(super) struct Resolved {
 /// # Errors
 /// The file cannot be read, has an unknown key or a value that the option refuses.
 pub(super) fn resolve(arguments: Vec<OsString>) -> anyhow::Result<Resolved> {
+    // Parsed once to find the file, and to report mistakes of the command line before those of the
+    // file.
     let flags = command().try_get_matches_from(&arguments)?;
     let matches = match flags.get_one::<PathBuf>("config") {
         Some(path) => {
             let mut all = read(path).with_context(|| format!("--config {}", path.display()))?;
+            // After those of the file: of an option that is given twice, the last one holds.
             all.extend(arguments);
             command().try_get_matches_from(all)?
         }
@@ -132,6 +134,7 @@ fn nearest(wrong: &str, keys: impl Iterator<Item = String>) -> String {
     let wrong_name = name(wrong);
     let distance = |key: &String| {
         let edits = strsim::damerau_levenshtein(&wrong_name, &name(key));
+        // Of two names that are equally near, the one in the same table.
         let is_other_table = key.contains('.') != wrong.contains('.');
         (edits, is_other_table)
     };
@@ -160,8 +163,11 @@ impl Resolved {
 
     fn write_value(&self, text: &mut String, option: &Arg) -> anyhow::Result<()> {
         let id = option.get_id().as_str();
-        let help = option.get_long_help().or(option.get_help());
-        let help = help.map(ToString::to_string).unwrap_or_default();
+        let help = option
+            .get_long_help()
+            .or(option.get_help())
+            .map(ToString::to_string)
+            .unwrap_or_default();
         // Writing to a String does not fail.
         let _ = writeln!(text);
         for line in help.lines().flat_map(wrapped) {
@@ -180,8 +186,11 @@ impl Resolved {
 
     /// The text of an option that is in effect: given, or a default.
     fn value(&self, id: &str) -> anyhow::Result<Option<String>> {
-        let given = self.matches.get_raw(id).and_then(|mut values| values.next_back());
-        let given = given.map(|value| value.to_string_lossy().into_owned());
+        let given = self
+            .matches
+            .get_raw(id)
+            .and_then(|mut values| values.next_back())
+            .map(|value| value.to_string_lossy().into_owned());
         match given {
             Some(given) => Ok(Some(given)),
             None => self.serve.default_value(id),
@@ -194,14 +203,16 @@ fn literal(text: &str) -> Value {
     let parsed = format!("x = {text}").parse::<Table>().ok().and_then(|mut one| one.remove("x"));
     match parsed {
         Some(scalar @ (Value::Integer(_) | Value::Float(_) | Value::Boolean(_))) => scalar,
+        // What is not a number or a boolean of TOML is a text, also a date.
         _ => Value::String(text.to_owned()),
     }
 }
 
 /// The lines of a comment.
 fn wrapped(line: &str) -> Vec<Cow<'_, str>> {
-    let options = textwrap::Options::new(98).break_words(false);
-    let options = options.word_splitter(textwrap::WordSplitter::NoHyphenation);
+    let options = textwrap::Options::new(98)
+        .break_words(false)
+        .word_splitter(textwrap::WordSplitter::NoHyphenation);
     textwrap::wrap(line, options.word_separator(textwrap::WordSeparator::AsciiSpace))
 }
 

@@ -180,6 +180,7 @@ pub(super) fn bytes_as_gib(bytes: u64) -> f64 {
 
 fn days(text: &str) -> Result<f64, String> {
     match text.parse() {
+        // NaN fails both comparisons; beyond the limit `Duration::from_secs_f64` could panic.
         Ok(days) if days > 0.0 && days <= MAX_DAYS => Ok(days),
         _ => Err(format!("expected days above 0 and up to {MAX_DAYS}")),
     }
@@ -191,6 +192,7 @@ fn seconds(text: &str) -> Result<f64, String> {
 
 /// Seconds, or 0 for no wait.
 fn waiting_seconds(text: &str) -> Result<f64, String> {
+    // 0 means not to wait at all, which other time-outs do not accept.
     if text.parse() == Ok(0.0) { Ok(0.0) } else { seconds(text) }
 }
 

@@ -97,6 +97,8 @@ mod otlp {
                 "{}: expected a URL, as http://127.0.0.1:4318",
                 cannot()
             );
+            // The exporter takes an endpoint as it is: the path of the specification is added if
+            // there is none.
             let url = if host.trim_end_matches('/').contains('/') {
                 endpoint.to_owned()
             } else {
@@ -105,8 +107,11 @@ mod otlp {
             // The exporter's HTTP client has no TLS provider. Another part of the program may have
             // installed one already.
             let _ = rustls::crypto::ring::default_provider().install_default();
-            let exporter = SpanExporter::builder().with_http().with_endpoint(url).build();
-            let exporter = exporter.with_context(cannot)?;
+            let exporter = SpanExporter::builder()
+                .with_http()
+                .with_endpoint(url)
+                .build()
+                .with_context(cannot)?;
             let batches = BatchConfigBuilder::default()
                 .with_max_queue_size(WAITING_SPANS)
                 .with_scheduled_delay(SENT_EVERY)
@@ -121,6 +126,8 @@ mod otlp {
                 .with_tracer(provider.tracer("wildcity"))
                 .with_location(false)
                 .with_threads(false)
+                // Spans of libraries, also those of the exporter's own requests, would be traced
+                // without end.
                 .with_filter(filter_fn(is_own_span));
             Ok((Self(provider), layer))
         }

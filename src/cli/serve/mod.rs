@@ -242,6 +242,7 @@ impl Serve {
             // An unknown or damaged twin is reported here, and not by the page.
             catalog.version(twin, None)?;
         }
+        // A damaged twin is reported and left out: the others are served.
         let found = catalog.twins()?;
         for DamagedTwin { name, error } in &found.damaged {
             tracing::error!(twin = name, "damaged, not served: {error}");
@@ -256,8 +257,8 @@ impl Serve {
         let tokens = self
             .tokens
             .as_deref()
-            .map(|path| Tokens::read(path).with_context(|| format!("--tokens {}", path.display())));
-        let tokens = tokens.transpose()?;
+            .map(|path| Tokens::read(path).with_context(|| format!("--tokens {}", path.display())))
+            .transpose()?;
         let tls = match (self.tls_cert, self.tls_key) {
             (Some(cert), Some(key)) => Some(TlsFiles { cert, key }),
             (None, None) => None,
@@ -313,6 +314,7 @@ impl Serve {
                 tracing::info!("metrics at http://{address}/metrics");
             }
             stop.await;
+            // A second signal ends the wait for running sessions.
             let again = wildcity_server::stop_signal()?;
             tokio::select! {
                 () = running.end_sessions() => {}

@@ -159,8 +159,9 @@ impl Block {
         let sees_one = |points_m: &[DVec3], index: usize| sees(&recorded.view(index), points_m);
         let seeing: Vec<usize> =
             (0..recorded.count()).filter(|&index| sees_one(&parts.own_m, index)).collect();
-        let across = seeing.iter().copied().filter(|&index| sees_one(&parts.halo_m, index));
-        let across = ChosenImages { all: recorded, chosen: across.collect() };
+        // Images that see both sides of a border show whether the blocks fit each other.
+        let see_both = seeing.iter().copied().filter(|&index| sees_one(&parts.halo_m, index));
+        let across = ChosenImages { all: recorded, chosen: see_both.collect() };
         let images = ChosenImages { all: recorded, chosen: seeing };
         ensure!(
             images.count() > 0,
@@ -220,6 +221,7 @@ impl Block {
     ) -> anyhow::Result<Trainer> {
         let Trained { base, images, parts, recording } = *what;
         let name = &self.edited.twin.name;
+        // The sky and the Gaussians around are drawn and not trained: other blocks train those.
         let sky = Cache::new(catalog.clone()).open(name, Some(base.number))?.sky().cloned();
         let fixed = Fixed { sky, chunks: Scene::from_gaussians(&parts.around).chunks };
         let profile = base.manifest.profile;
@@ -266,6 +268,7 @@ impl Block {
         })?;
         let done = trainer.steps_done();
         let steps = trainer.settings().steps;
+        // A signal has stopped the training: the checkpoint is all that is kept of it.
         if done < steps {
             let mut how = "begin anew";
             if let Some(checkpoints) = &checkpoints {
@@ -317,6 +320,7 @@ impl Block {
             writeln!(stdout, "no image that is held out sees both sides of a border")?;
             return Ok(());
         }
+        // Read back, so that what is judged has the rounding of the record.
         let published = Parts::read(catalog, &version, blocks, number - 1)?;
         let mut gaussians = published.moving;
         gaussians.append(&published.around);
@@ -347,6 +351,8 @@ impl Block {
         );
         settings.steps = self.steps.map_or(settings.steps, |steps| steps as usize);
         settings.growth.cap = self.cap.map_or(settings.growth.cap, |cap| cap as usize);
+        // Blocks are joined later, and must agree about what they share: poses, exposures and the
+        // sky.
         keep_trained(&mut settings);
         settings.check()?;
         Ok(settings)

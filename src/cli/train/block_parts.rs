@@ -38,6 +38,7 @@ impl Parts {
         let mut halo_m = Vec::new();
         let is_near = |bounds: &Bounds| {
             let middle_m = 0.5 * (bounds.min_m + bounds.max_m);
+            // Half the diagonal: no point of the box is farther from its middle.
             let half_m = middle_m.distance(bounds.max_m);
             blocks.distance_m(block, middle_m) <= BEHIND_M + half_m
         };
@@ -53,6 +54,7 @@ impl Parts {
             let moves = at(&|distance_m| distance_m <= HALO_M);
             for &k in &moves {
                 let mean_m = DVec3::from_array(section.means_m[k]);
+                // The distance is 0 within the cells of the block.
                 if distances[k] > 0.0 { halo_m.push(mean_m) } else { own_m.push(mean_m) }
             }
             moving.append(&section.select(moves));
@@ -64,6 +66,7 @@ impl Parts {
 
 /// Some of all points, at equal distances in their list.
 pub(super) fn sample(points_m: Vec<DVec3>) -> Vec<DVec3> {
+    // Spread over all: the order of the points is that of the cells.
     let every = points_m.len().div_ceil(SAMPLE).max(1);
     points_m.into_iter().step_by(every).collect()
 }

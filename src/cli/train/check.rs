@@ -110,6 +110,7 @@ impl Check {
             }
             print_times(&mut out, &times)?;
         }
+        // After the table, which shows the bounds that are exceeded.
         ensure!(exceeded == 0, "{exceeded} bounds are exceeded");
         if !self.json {
             writeln!(out, "every bound holds")?;

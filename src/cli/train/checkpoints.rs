@@ -71,6 +71,8 @@ impl Checkpoints {
 /// The file of a run that writes `out`.
 fn path(out: &Path) -> PathBuf {
     let mut name = out.as_os_str().to_owned();
+    // Appended and not put in place of the extension: two outputs that differ only in theirs have
+    // two checkpoints.
     name.push(".checkpoint");
     name.into()
 }
@@ -102,6 +104,7 @@ pub(super) struct StopsAtSignal;
 
 impl StopsAtSignal {
     pub(super) fn new() -> anyhow::Result<Self> {
+        // A comparison trains several times in one process, and needs one thread for all.
         static LISTENS: OnceLock<()> = OnceLock::new();
         if LISTENS.set(()).is_ok() {
             let runtime = runtime::Builder::new_current_thread().enable_all().build()?;
@@ -113,10 +116,13 @@ impl StopsAtSignal {
             let listen = async move {
                 first.await;
                 STOPS.store(true, Ordering::Relaxed);
+                // The first signal lets the step end and the checkpoint be written; a second one
+                // ends at once.
                 if TRAINS.load(Ordering::Relaxed) {
                     let Ok(second) = wildcity_server::stop_signal() else { return };
                     second.await;
                 }
+                // 128 and the number of SIGINT, as shells report it.
                 process::exit(130);
             };
             let thread = thread::Builder::new().name("signals".to_owned());

@@ -53,6 +53,7 @@ Example:
 impl Compare {
     pub(super) fn run(mut self) -> anyhow::Result<()> {
         output::create_dir(&self.out)?;
+        // Sorted and each once, so that the order of the options does not change the table.
         self.size.sort_by(f64::total_cmp);
         self.size.dedup();
         for numbers in [&mut self.steps, &mut self.cap] {
@@ -66,6 +67,7 @@ impl Compare {
         let Inputs { images: opened, settings, .. } =
             self.source.open(self.source.settings()?, largest, largest_cap)?;
         let all = self.combinations(settings.growth.cap);
+        // All runs are judged by the same images, the largest: small ones hide what is blurred.
         let judges = opened.images();
         ensure!(
             !judges.held_out().is_empty(),
@@ -82,6 +84,7 @@ impl Compare {
                 "run {number} of {}: size {size}, {steps} steps, cap {cap}",
                 all.len()
             )?;
+            // Stopped by a signal: what is complete has been written already.
             let Some(trainer) = self.train(backend, size, steps, cap)? else {
                 let done = output::counted(runs.len(), "run");
                 bail!("stopped: {done} of {} complete", all.len());
@@ -97,6 +100,7 @@ impl Compare {
                 held_out_db: judged.mean_db,
             });
             pictures.push(judged.middle);
+            // After each run, so that hours of work are not lost if a later one fails.
             self.write(&Comparison {
                 source: &source,
                 command: &command,
@@ -161,8 +165,10 @@ impl Compare {
 /// The command that makes one of the runs, but for its size, steps and cap: that of a comparison
 /// with its other options.
 fn command_of_a_run(arguments: impl Iterator<Item = OsString>) -> String {
-    let words = arguments.map(|word| word.to_string_lossy().into_owned());
-    let mut words = words.skip_while(|word| word != "compare").skip(1);
+    let mut words = arguments
+        .map(|word| word.to_string_lossy().into_owned())
+        .skip_while(|word| word != "compare")
+        .skip(1);
     let mut command = "wildcity train".to_owned();
     while let Some(word) = words.next() {
         let (name, has_value) = match word.split_once('=') {

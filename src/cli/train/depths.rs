@@ -38,6 +38,7 @@ impl Depths {
         let cell = self.cell([x, y]);
         self.nearest_m[cell] = self.nearest_m[cell].min(depth_m);
         let own = &mut self.depth_m[y * self.size_px[0] + x];
+        // 0 means that no point is there: it must not win as the nearest.
         *own = if *own == 0.0 { depth_m } else { own.min(depth_m) };
     }
 
@@ -45,6 +46,8 @@ impl Depths {
     pub(super) fn seen(mut self) -> Vec<f32> {
         for pixel in 0..self.depth_m.len() {
             let cell = self.cell([pixel % self.size_px[0], pixel / self.size_px[0]]);
+            // Points are sparse: one of the background shows between those of what hides it, a few
+            // pixels away.
             if self.depth_m[pixel] > HIDDEN * self.nearest_m[cell] {
                 self.depth_m[pixel] = 0.0;
             }

@@ -95,6 +95,7 @@ impl ListedImages {
             let RealImage { name, camera, file, mask, depth, weight, exposure_stops, .. } = image;
             text +=
                 &format!("{name} {camera:?} {world_from_camera:?} {weight:?} {exposure_stops:?}");
+            // Sizes stand for contents, which would take long to hash.
             for file in [Some(file), mask.as_ref(), depth.as_ref()] {
                 text +=
                     &format!(" {:?}", file.and_then(|file| file.metadata().ok()).map(|m| m.len()));
@@ -130,6 +131,7 @@ impl TrainingImages for WithAugmented<'_> {
     }
 
     fn is_held_out(&self, index: usize) -> bool {
+        // A drawn image is no truth, by which a scene could be judged.
         !self.is_augmented(index) && self.recorded.is_held_out(index)
     }
 
@@ -244,6 +246,7 @@ pub(super) fn factor(exposure_stops: Option<f64>) -> f32 {
 fn read_mask(file: &Path, size_px: [u32; 2]) -> anyhow::Result<Vec<bool>> {
     let mask = picture::mask(file, size_px)?;
     let name = file.display();
+    // Most often the mask is inverted, which a training would show only as a poor scene.
     ensure!(mask.contains(&true), "the mask {name} leaves no pixel: dark pixels do not count");
     Ok(mask)
 }
@@ -251,6 +254,7 @@ fn read_mask(file: &Path, size_px: [u32; 2]) -> anyhow::Result<Vec<bool>> {
 /// A mask or a depth at a smaller size: a pixel has the value of the one at its middle.
 pub(super) fn shrink<T: Copy>(values: &[T], own_px: [u32; 2], small_px: [u32; 2]) -> Vec<T> {
     let at = |axis: usize, px: u32| {
+        // The pixel at the middle of the small one: a mask and a depth have no values in between.
         ((f64::from(px) + 0.5) * f64::from(own_px[axis]) / f64::from(small_px[axis])) as usize
     };
     let row = |y: u32| &values[at(1, y) * own_px[0] as usize..][..own_px[0] as usize];

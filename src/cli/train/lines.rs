@@ -23,6 +23,7 @@ impl LinesFile {
         let mut file = options.open(path).with_context(cannot)?;
         let mut kept = 0;
         let mut lines = BufReader::new(&file);
+        // A run that goes on from a checkpoint repeats the steps after it: their lines are cut off.
         for _ in 0..done {
             kept += lines.read_until(b'\n', &mut Vec::new()).with_context(cannot)? as u64;
         }

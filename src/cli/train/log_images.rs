@@ -106,6 +106,8 @@ impl LogImages {
             return;
         }
         let mut order: Vec<usize> = (0..self.images.len()).collect();
+        // By camera and then by time: in the order of the rows every n-th image could be of one
+        // camera.
         order.sort_by_key(|&index| {
             let ImageRow { camera, time_us, .. } = &self.images[index].row;
             (camera, *time_us)
@@ -123,12 +125,15 @@ impl LogImages {
             self.left_out += 1;
             return Ok(());
         };
+        // Cameras that are triggered together share one pose of the rig, which is trained for all
+        // of them.
         let is_later = |before: &i64| row.time_us > before.saturating_add(SAME_TIME_US);
         if self.times_us.last().is_none_or(is_later) {
             self.times_us.push(row.time_us);
             self.rig.world_from_ego.push(world_from_rig);
         }
         let ego = self.rig.world_from_ego.len() - 1;
+        // What remains of the recorded motion between the shared time and that of the image.
         let motion = self.rig.world_from_ego[ego].inverse() * world_from_rig;
         self.images.push(LoggedImage { row, place: Place { ego, camera, motion } });
         Ok(())
@@ -144,6 +149,7 @@ impl LogImages {
         let is_of_log =
             drive.keyframes.iter().map(|key| key.time_us).eq(self.times_us.iter().copied());
         let names = rig.cameras.iter().map(|camera| &camera.name);
+        // Of another log, or of other cameras of it: the poses would belong to other images.
         if !is_of_log || !names.eq(&self.camera_names()) {
             return false;
         }
@@ -216,11 +222,12 @@ impl LogImages {
             let size_px = [width, height];
             let mask = picture::mask(&file, size_px)?;
             // The mask has the size of its image, which may be smaller than the calibrated one.
-            let camera = self.log.rig.cameras[place.camera].camera;
-            let camera = camera.scaled(width.into(), height.into())?;
+            let camera =
+                self.log.rig.cameras[place.camera].camera.scaled(width.into(), height.into())?;
             let camera_from_world = self.rig.world_from_camera(*place).inverse();
             for (point_m, votes) in points_m.iter().zip(&mut votes) {
                 let at_m = camera_from_world.transform_point(*point_m);
+                // Far away one pixel of a mask covers metres of the ground.
                 let near = Some(at_m).filter(|at_m| at_m.length() < GROUND_M);
                 let Some(px) = near.and_then(|at_m| camera.project(at_m)) else { continue };
                 let [x, y] = px.floor().to_array().map(|px| px as i64);
@@ -232,6 +239,7 @@ impl LogImages {
             }
         }
         for (label, [no, yes]) in labels.iter_mut().zip(votes) {
+            // A point that no mask shows keeps the label of its height.
             if no + yes > 0 {
                 *label = yes > no;
             }
@@ -275,8 +283,10 @@ impl LogImages {
         let depth_m = self.depths(row, place.camera, &view)?;
         let exposure = factor(row.exposure_stops);
         let Shrunk { rgb8, mask, own_px, .. } = shrunk;
-        let sky = row.sky_mask.as_deref().map(|file| picture::mask(&path(file), own_px));
-        let sky = sky
+        let sky = row
+            .sky_mask
+            .as_deref()
+            .map(|file| picture::mask(&path(file), own_px))
             .transpose()?
             .map(|sky| shrink(&sky, own_px, [view.camera.width_px, view.camera.height_px]));
         Ok(TrainingImage { view, rgb8, mask, sky, depth_m, weight: 1.0, exposure })
@@ -286,6 +296,7 @@ impl LogImages {
     fn sweeps_near(&self, time_us: i64) -> impl Iterator<Item = &SweepRow> {
         let from_us = time_us.saturating_sub(SWEEP_US);
         let until_us = time_us.saturating_add(SWEEP_US);
+        // Sorted by their beginning only: a sweep that begins earlier than this has ended before.
         let earliest_us = from_us.saturating_sub(self.longest_sweep_us);
         let first = self.sweeps.partition_point(|sweep| sweep.time_us < earliest_us);
         let last = self.sweeps.partition_point(|sweep| sweep.time_us <= until_us);
@@ -309,13 +320,18 @@ impl LogImages {
         let near = self.tracks.near(row.time_us);
         for sweep in self.sweeps_near(row.time_us) {
             for (time_us, rig_m) in self.log.points_on_rig(sweep)? {
+                // A part of a sweep may be too early or too late, although the sweep as a whole is
+                // near.
                 if time_us.abs_diff(row.time_us) > SWEEP_US.unsigned_abs() {
                     continue;
                 }
                 let Some(world_from_rig) = self.poses.at(time_us) else { continue };
                 let world_m = world_from_rig.transform_point(rig_m);
                 let Some((at_px, _)) = projection.project(world_m) else { continue };
+                // With a rolling shutter the camera is elsewhere for each row, also along its axis.
                 let camera_m = view.world_from_camera_at(at_px).inverse().transform_point(world_m);
+                // A moving object is elsewhere at the time of the image than when the point was
+                // seen.
                 if !near.hides(world_m, time_us) {
                     depths.add(at_px.as_uvec2().to_array(), view.camera.depth_m(camera_m) as f32);
                 }

@@ -217,6 +217,7 @@ impl SourceOptions {
     ) -> anyhow::Result<()> {
         if cap.is_none() && !self.start.is_scene() && !self.settings_have_cap()? {
             let determined = (pixels / PIXELS_PER_GAUSSIAN).ceil().max(1.0) as usize;
+            // More Gaussians than the images can determine fit noise.
             settings.growth.cap = settings.growth.cap.min(determined);
         }
         Ok(())
@@ -225,6 +226,7 @@ impl SourceOptions {
     /// Whether the file of `--settings` says how many Gaussians there may be.
     fn settings_have_cap(&self) -> anyhow::Result<bool> {
         let Some(path) = &self.settings else { return Ok(false) };
+        // As a table and not as settings, in which an absent field has its default already.
         let table: toml::Table = read_toml(path)?;
         Ok(table.get("growth").is_some_and(|growth| growth.get("cap").is_some()))
     }
@@ -253,6 +255,7 @@ const PIXELS_PER_GAUSSIAN: f64 = 32.0;
 /// The pixels of all images, at a fraction of their width.
 pub(super) fn image_pixels(images: &dyn TrainingImages, size: f64) -> f64 {
     let whole: usize = (0..images.count()).map(|k| images.view(k).camera.pixels()).sum();
+    // Both sides are scaled.
     size * size * whole as f64
 }
 

@@ -111,6 +111,7 @@ impl Plan {
         let step_s = |(step, count): (usize, usize)| {
             let pixels = shares[settings.halvings_at(step + 1) as usize];
             let step_s = measured.step_s(count, begin, pixels);
+            // Another thread decodes at the same time: the slower of both counts.
             if is_decoded(step) { step_s.max(measured.decode_s) } else { step_s }
         };
         let steps_s: f64 = settings.counts(begin).enumerate().map(step_s).sum();
@@ -143,6 +144,7 @@ fn shares(images: &dyn TrainingImages, size: f64, most: u32) -> anyhow::Result<V
         anyhow::Ok(View { camera, ..view })
     };
     let views = (0..images.count()).map(small).collect::<anyhow::Result<Vec<View>>>()?;
+    // Half of each side is a quarter of the pixels; small images are halved less often.
     let share = |wanted: u32| {
         let all = views.iter().map(|view| 0.25_f64.powi(halvings(view, wanted) as i32));
         all.sum::<f64>() / views.len().max(1) as f64
@@ -192,10 +194,12 @@ impl Measured {
         backend: &dyn Differentiate,
     ) -> anyhow::Result<Self> {
         let learned = (0..images.count()).filter(|&index| !images.is_held_out(index));
+        // Spread over the list: images of one place would all show as many Gaussians.
         let every = images.count().div_ceil(MEASURED).max(1);
         let chosen: Vec<usize> = learned.step_by(every).collect();
         let count = chosen.len();
         let chosen = ChosenImages { all: images, chosen };
+        // Decoded beforehand, so that the steps below measure no decoding.
         let images = CachedImages::new(&chosen, usize::MAX);
         let begin = Instant::now();
         for index in 0..count {
@@ -212,6 +216,7 @@ impl Measured {
         let stages = lines.iter().flat_map(|line| &line.stages_ms);
         let is_of_pixels = |name: &str| OF_PIXELS.contains(&name);
         let pixels_ms: f64 = stages.filter(|(name, _)| is_of_pixels(name)).map(|(_, ms)| ms).sum();
+        // The sum of the stages may exceed the step, if some of them overlap.
         let fixed_s = (1e-3 * pixels_ms / steps).min(step_s);
         Ok(Self { decode_s, fixed_s, gaussians_s: step_s - fixed_s })
     }

@@ -42,6 +42,7 @@ pub(super) fn train(
     let mut failed = None;
     let mut on_step = |line: &Line, trainer: &Trainer| {
         bar.set_position(line.step as u64);
+        // Only the last evaluation is returned: later lines have none.
         if let Some(db) = line.held_out_db {
             bar.set_message(format!("{db:.2} dB"));
             last = Some((db, line.seconds));

@@ -90,6 +90,7 @@ impl RecordedImages {
             images.display()
         );
         let mut logged = LogImages::new(Log::open(images)?, size, held_out_every)?;
+        // A scene fits the poses with which it was trained, not those that were recorded.
         if !logged.take_refined(&base.manifest) {
             writeln!(
                 io::stderr(),

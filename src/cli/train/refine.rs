@@ -137,6 +137,7 @@ impl Refine {
         for image in rounds.iter().flat_map(|round| round.every(1)) {
             // By its name, so that both sides and all cameras have their share.
             let is_judge = blake3::hash(image.name.as_bytes()).as_bytes()[0].is_multiple_of(JUDGES);
+            // Centimetres as an integer can be a key; a number of metres cannot.
             let offset = offset_cm(&image.name).filter(|_| is_judge);
             let images = match offset {
                 Some(offset) => {
@@ -265,12 +266,15 @@ impl Refine {
 
     fn training_settings(&self) -> anyhow::Result<Settings> {
         let mut settings = Settings::default();
+        // The scene is trained already: positions need only small steps.
         settings.rates.mean *= 0.1;
         if let Some(path) = &self.settings {
             settings = read_settings(path)?;
         }
         settings.steps = self.steps as usize;
         keep_trained(&mut settings);
+        // No growth and no noise: the number of Gaussians stays, and what is learned already is
+        // kept.
         settings.growth.from = 0;
         settings.growth.until = 0;
         settings.growth.noise = 0.0;

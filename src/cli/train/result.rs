@@ -39,6 +39,7 @@ impl Written {
         refined: Option<&(Trajectory, Rig)>,
     ) -> anyhow::Result<Self> {
         let gaussians = trainer.model().to_gaussians();
+        // A file that is refused when it is read would be noticed only after the run is gone.
         validate::check(&gaussians, &Field::plain_name)
             .context("the run has made Gaussians that no scene may have: use smaller rates")?;
         let mut bytes = Vec::new();

@@ -96,6 +96,7 @@ impl Loop {
             writeln!(io::stderr(), "round {round} of {rounds}")?;
             let again = || format!("round {round}: --from {round} goes on");
             let twin = self.twin.as_ref();
+            // Through the command line, so that defaults and checks are those of the two commands.
             cli::run_command(&["train".as_ref(), "augment".as_ref(), twin], self.augment(round))
                 .with_context(again)?;
             cli::run_command(&["train".as_ref(), "refine".as_ref(), twin], self.refine(round))

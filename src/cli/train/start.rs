@@ -78,8 +78,8 @@ impl StartOptions {
             None => listed_points(source)?,
         };
         ensure!(source.exists(), "there are no points at {}", source.display());
-        let read = capture::read_points(&source)?;
-        let read = read.filter(|points| !points.is_empty()).with_context(|| {
+        let found = capture::read_points(&source)?;
+        let read = found.filter(|points| !points.is_empty()).with_context(|| {
             format!(
                 "{} has no points to begin with: give --points, a PLY file or a COLMAP model with \
                  points3D.bin or points3D.txt",

@@ -57,6 +57,7 @@ fn blind<'a>(
     let scene = OpenScene::Twin(resident);
     let profile = version.manifest.profile;
     let backend = Cpu::new(0, Simd::Best)?;
+    // One place at which it sees something is enough for a camera: it is not drawn again.
     let mut unseen: Vec<&RigCamera> = rig.cameras.iter().collect();
     for place in places {
         let views = views(&unseen, place)?;
@@ -74,6 +75,7 @@ fn blind<'a>(
 
 fn is_seen(opacity: &[f32]) -> bool {
     let opaque = opacity.iter().filter(|&&opacity| opacity > 0.5).count();
+    // Pixels and not Gaussians are counted: one large Gaussian is enough to see something.
     opaque as f64 >= LEAST_SEEN * opacity.len() as f64
 }
 
@@ -94,6 +96,7 @@ fn places(version: &Version) -> Vec<Pose> {
 /// Indices of at most this many of `count` things, evenly from the first to the last one.
 fn spread(count: usize, most: usize) -> impl Iterator<Item = usize> {
     let chosen = count.min(most);
+    // From the first to the last. Of none the closure is never called, so that nothing underflows.
     (0..chosen).map(move |at| at * (count - 1) / (chosen - 1).max(1))
 }
 
@@ -105,6 +108,7 @@ fn view(camera: &RigCamera, world_from_rig: &Pose) -> anyhow::Result<View> {
     let full = &camera.camera;
     let shrink = f64::from(SIDE_PX) / f64::from(full.width_px.max(full.height_px));
     let side = |full_px: u32| (f64::from(full_px) * shrink).ceil().max(1.0) as u64;
+    // Whether anything is seen at all does not need detail, and a small image is drawn fast.
     let small = full.scaled(side(full.width_px), side(full.height_px))?;
     Ok(View::new(small, *world_from_rig * camera.rig_from_camera))
 }

@@ -37,6 +37,7 @@ impl Diff {
         let mut changed = 0;
         for CellDiff { cell: [x, y], before, after } in &cells {
             let (sign, count) = match (before, after) {
+                // A cell that neither version has is not in the list.
                 (None, _) => ("+", &mut added),
                 (_, None) => ("-", &mut removed),
                 _ => ("~", &mut changed),

@@ -39,6 +39,7 @@ pub(super) struct Fsck {
 impl Fsck {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let catalog = self.twins.catalog()?;
+        // Before the check, which then tells whether the rest of the log is sound.
         if self.repair {
             for RecordSetAside { number, error, path } in catalog.repair_log(&self.twin)? {
                 let path = path.display();

@@ -88,9 +88,11 @@ impl Generate {
         let city = wildcity_generate::city(&settings)?;
         let drive = wildcity_generate::city_drive(&settings)?;
         let spoil = self.spoil.map(|amount| Spoil::new(amount, settings.seed, &drive));
+        // Mistakes in the options are found before gigabytes are written.
         let spoil = spoil.transpose()?;
         let catalog = self.twins.catalog()?;
         let gaussians = settings.gaussians();
+        // An object store has no free space that could be asked for.
         let is_on_disk = catalog.traffic().is_none();
         if is_on_disk {
             check_free_space(catalog.dir(), gaussians)?;
@@ -101,6 +103,7 @@ impl Generate {
             catalog.begin(&self.twin, CommitKind::Import, StorageOptions::default())?;
         let bar = progress::count("building");
         bar.set_length(gaussians);
+        // Cell by cell: a city of kilometres does not fit into memory.
         for cell in city {
             let spoiled = spoil.as_ref().map(|spoil| spoil.apply(&cell.gaussians));
             commit.put(spoiled.as_ref().unwrap_or(&cell.gaussians), None, &mut |_, _| {})?;
@@ -150,8 +153,8 @@ impl Generate {
 fn check_free_space(dir: &Path, gaussians: u64) -> anyhow::Result<()> {
     // The directory may not exist yet; then its nearest parent is on the same disk.
     let existing = dir.ancestors().find(|dir| dir.is_dir()).unwrap_or(Path::new("."));
-    let disk = rustix::fs::statvfs(existing);
-    let disk = disk.with_context(|| format!("cannot read the free space of {}", dir.display()))?;
+    let disk = rustix::fs::statvfs(existing)
+        .with_context(|| format!("cannot read the free space of {}", dir.display()))?;
     let free_bytes = disk.f_bavail.saturating_mul(disk.f_frsize);
     let needed_bytes = gaussians.saturating_mul(STORED_BYTES);
     let gib = |bytes: u64| bytes as f64 / f64::from(1 << 30);

@@ -66,6 +66,7 @@ Examples:
 fn parse_class(name: &str) -> Result<SemanticClass, String> {
     let class = SemanticClass::from_name(name).filter(|class| *class != SemanticClass::None);
     class.ok_or_else(|| {
+        // Without the first one, `None`, which a label cannot be.
         let names: Vec<&str> = SemanticClass::ALL[1..].iter().map(|class| class.name()).collect();
         format!("there is no class {name:?}; the classes are {}", names.join(", "))
     })
@@ -112,6 +113,7 @@ impl Label {
             places.push((region.place(), *class));
         }
         let drive_boxes = DriveBoxes::new(drives);
+        // The drive is on the road: its height is that of the ground around it.
         let drives = Ground::from_drives(drives).with_boxes(&drive_boxes);
         let is_ground = |at_m: DVec3| {
             let placed = drives.find(Pose { position_m: at_m, ..Pose::IDENTITY });

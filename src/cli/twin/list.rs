@@ -36,6 +36,7 @@ impl List {
                 writeln!(out, "{:<24} version {:<6} {}", twin.name, twin.number, twin.hash)?;
             }
         }
+        // Listed and not an error: one damaged twin must not hide the others.
         for DamagedTwin { name, error } in list.damaged {
             if self.json {
                 let line = serde_json::json!({ "name": name, "damaged": error.to_string() });

@@ -37,6 +37,7 @@ impl Log {
         for entry in catalog.versions(&self.twin)? {
             match catalog.provenance(&self.twin, &entry) {
                 Ok(provenance) => _ = provenances.insert(entry.number, provenance),
+                // Its manifest was removed on purpose, and with it the note.
                 Err(StoreError::GarbageCollected { .. }) => {}
                 Err(error) => writeln!(io::stderr(), "version {}: no note: {error}", entry.number)?,
             }
@@ -50,6 +51,7 @@ impl Log {
                 .filter(|_| is_edit)
                 .map(|(own, base)| added(own, base).join(", "))
                 .unwrap_or_default();
+            // A training commits as an edit does: only its options tell them apart.
             let is_training = ["blocks=", "refine="].iter().any(|how| change.starts_with(how));
             let how = if is_training { "training" } else { entry.kind_name() };
             let LogEntry { number, hash, created_us, commit, parent, .. } = &entry;

@@ -77,6 +77,7 @@ fn summary(
     }
     let sections = || manifest.chunks.iter().flat_map(|chunk| &chunk.sections);
     let count = sections().count();
+    // A twin without Gaussians has no section.
     let max_level = sections().map(|section| section.level).max().unwrap_or(0);
     writeln!(
         out,

@@ -154,8 +154,8 @@ impl Views {
                     None => placement::from_version(&catalog, &base)?,
                 };
                 listed = list.every(1).len();
-                let views = self.put(&mut commit, manifest, &list, &alignment)?;
-                let views = commit.put_views(&views)?;
+                let stored = self.put(&mut commit, manifest, &list, &alignment)?;
+                let views = commit.put_views(&stored)?;
                 commit.set_views(Some(views));
             }
         }
@@ -192,6 +192,7 @@ impl Views {
             placed.push(Placed { image, camera_name, trajectory, place, alignment });
         }
         let mut distances_m: Vec<f64> = placed.iter().map(|one| one.place.distance_m).collect();
+        // The median: a few images beside the drives, such as those of a crossing, are no mistake.
         distances_m.sort_by(f64::total_cmp);
         let median_m = distances_m.get(distances_m.len() / 2).copied().unwrap_or(0.0);
         ensure!(
@@ -200,6 +201,8 @@ impl Views {
              the poses have other axes or another unit; see --axes and --scale"
         );
         let order = |one: &Placed<'_>| (one.trajectory.name.clone(), one.camera_name.clone());
+        // Images of one camera along one drive follow one another, so that each needs to be
+        // compared only with the one that was kept last.
         placed.sort_by(|a, b| {
             order(a).cmp(&order(b)).then(a.place.station_m.total_cmp(&b.place.station_m))
         });
@@ -245,10 +248,12 @@ impl Views {
         Placed { image, camera_name, .. }: &Placed<'_>,
     ) -> anyhow::Result<(Camera, ObjectRef, Option<ObjectRef>)> {
         let background = manifest.profile.background;
+        // What is transparent gets the background that the renderer draws there as well.
         let (mut rgb8, mut camera) = picture::real(&image.file, &image.camera, background)?;
-        let [width, height] = [camera.width_px, camera.height_px];
-        let mask = image.mask.as_deref();
-        let mask = mask.map(|file| picture::mask(file, [width, height])).transpose()?;
+        let width = camera.width_px;
+        let height = camera.height_px;
+        let mask =
+            image.mask.as_deref().map(|file| picture::mask(file, [width, height])).transpose()?;
         let outside = own_vehicle::outside(manifest.rig.as_ref(), camera_name, [width, height]);
         let mut counts = own_vehicle::both(mask, outside);
         let longest = width.max(height);
@@ -260,14 +265,17 @@ impl Views {
             let small = [scaled(width), scaled(height)];
             camera = camera.scaled(small[0].into(), small[1].into())?;
             camera.native_size_px = None;
-            let large = RgbImage::from_raw(width, height, rgb8);
-            let large = large.context("an image has 3 bytes per pixel")?;
+            let large = RgbImage::from_raw(width, height, rgb8)
+                .context("an image has 3 bytes per pixel")?;
+            // Lanczos keeps fine edges, which a box filter would blur.
             rgb8 = imageops::resize(&large, small[0], small[1], FilterType::Lanczos3).into_raw();
             counts = counts.map(|counts| reduced_mask(&counts, [width, height], small));
         }
-        let [width, height] = [camera.width_px, camera.height_px];
+        let width = camera.width_px;
+        let height = camera.height_px;
         let file = wildcity_session::jpeg(&rgb8, width, height, self.quality);
         let stored = commit.put_image(&file.map_err(anyhow::Error::msg)?)?;
+        // A mask in which every pixel counts says nothing, and is not stored.
         let Some(counts) = counts.filter(|counts| counts.contains(&false)) else {
             return Ok((camera, stored, None));
         };

@@ -87,7 +87,8 @@ fn check_numbers(document: &Document<'_>) -> Result<(), ConvertError> {
         for attribute in node.attributes().filter(|one| numbers.contains(&one.name())) {
             let value: Option<f64> = attribute.value().trim().parse().ok();
             if !value.is_some_and(f64::is_finite) {
-                let [name, value] = [attribute.name(), attribute.value()];
+                let name = attribute.name();
+                let value = attribute.value();
                 return Err(wrong(node, format!("{name}={value:?}; write a finite number")));
             }
         }

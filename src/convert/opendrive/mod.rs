@@ -78,8 +78,8 @@ pub fn read(bytes: &[u8], origin: Option<[f64; 2]>) -> Result<Imported, ConvertE
     if lanes.is_empty() {
         return Err(ConvertError::new("OpenDRIVE", "has no lane of any width; check the file"));
     }
-    let areas = network.junction_areas().iter().filter(|area| area.boundary.len() >= 3);
-    let areas = areas.map(|area| Area {
+    let junctions = network.junction_areas().iter().filter(|area| area.boundary.len() >= 3);
+    let areas = junctions.map(|area| Area {
         kind: AreaKind::Intersection,
         outline: area.boundary.iter().map(|point| array(*point)).collect(),
     });
@@ -167,8 +167,8 @@ pub(crate) fn across_road(network: &RoadNetwork, road: RoadId, s: f64) -> Option
     // Two points 20 m apart: rounding by 1 mm turns their direction by 5e-5 rad at most.
     let [left, right] =
         [ASIDE_M, -ASIDE_M].map(|t| network.road_point(RoadPosition { road, s, t }));
-    let across = left? - right?;
-    let across = DVec3::new(f64::from(across.x), f64::from(across.y), 0.0);
+    let apart = left? - right?;
+    let across = DVec3::new(f64::from(apart.x), f64::from(apart.y), 0.0);
     (across.length() > ASIDE_M).then(|| across.normalize())
 }
 

@@ -243,13 +243,14 @@ fn lane_change(
         "RelativeTargetLane" => {
             let of = target.text("entityRef")?;
             let count = target.whole("value")?;
-            let entity = context.entities.get(&of);
-            let entity =
-                entity.ok_or_else(|| target.wrong(&format!("there is no entity {of:?}")))?;
+            let entity = context
+                .entities
+                .get(&of)
+                .ok_or_else(|| target.wrong(&format!("there is no entity {of:?}")))?;
             // The lane is that after the changes that were read so far. The direction is that of
             // the start.
             let spot = entity.place.and_then(|place| place.spot);
-            let (Some(lane), Some(spot)) = (entity.lane, spot) else {
+            let Some((lane, spot)) = entity.lane.zip(spot) else {
                 return Err(target.wrong(&format!("{of:?} is on no lane")));
             };
             if of == context.ego && context.is_in_story {

@@ -69,8 +69,10 @@ impl Builder<'_, '_> {
     /// An actor: on its trajectory, through timed positions, standing, along its lane, or straight
     /// on.
     pub(super) fn actor_section(&self, entity: &Entity) -> Result<ActorSection, String> {
-        let place = entity.place.or_else(|| first_place(entity.line.as_ref()?));
-        let place = place.ok_or("has no position in <Init>; add a <TeleportAction>")?;
+        let place = entity
+            .place
+            .or_else(|| first_place(entity.line.as_ref()?))
+            .ok_or("has no position in <Init>; add a <TeleportAction>")?;
         let time_s = self.end_s.unwrap_or(USUAL_S);
         let fastest_mps = entity.fastest_mps.max(entity.begin_mps);
         // As far as the actor can come until the end. Of a standing actor, 100 m are left for its
@@ -221,7 +223,8 @@ impl Builder<'_, '_> {
             return Err("has a trajectory of less than two points".into());
         };
         // The direction of the last piece decides with which lane it goes on.
-        let (last, way) = (*last, [last[0] - before[0], last[1] - before[1]]);
+        let way = [last[0] - before[0], last[1] - before[1]];
+        let last = *last;
         let yaw_rad = way[1].atan2(way[0]);
         let place = Place { xyz_m: last, yaw_rad, spot: None };
         let roads = self.context.roads.as_ref();
@@ -380,7 +383,8 @@ fn moved_left(points: &[[f64; 3]], left_m: f64) -> Vec<[f64; 3]> {
     let last = points.len().saturating_sub(1);
     let moved = (0..points.len()).map(|index| {
         // The direction at a point is that from the point before to the point after.
-        let [from, to] = [points[index.saturating_sub(1)], points[(index + 1).min(last)]];
+        let from = points[index.saturating_sub(1)];
+        let to = points[(index + 1).min(last)];
         let ahead = DVec2::new(to[0] - from[0], to[1] - from[1]).normalize_or_zero();
         let [x, y, z] = points[index];
         [x - left_m * ahead.y, y + left_m * ahead.x, z]

@@ -110,8 +110,8 @@ impl<'a> Catalogs<'a> {
             return Err(reference.wrong(&message));
         };
         // The entry may use the parameters of the place that refers to it.
-        let entry = Element::new(*node, reference.parameters().clone(), self.ledger, *source);
-        let entry = declared(&entry)?;
+        let own = Element::new(*node, reference.parameters().clone(), self.ledger, *source);
+        let entry = declared(&own)?;
         let mut parameters = BTreeMap::clone(entry.parameters());
         if let Some(assignments) = reference.find("ParameterAssignments")? {
             assignments.only(&["ParameterAssignment"])?;

@@ -132,10 +132,10 @@ fn by_value(
                 "completeState" => PhaseSection::Ended,
                 other => return Err(kind.wrong(&format!("state={other:?} is not read"))),
             };
-            let name = kind.text("storyboardElementRef");
-            let name = name.or_else(|_| kind.raw("storyboardElementRef"))?;
+            let path =
+                kind.text("storyboardElementRef").or_else(|_| kind.raw("storyboardElementRef"))?;
             // A name may be a path.
-            let name = name.rsplit("::").next().unwrap_or_default();
+            let name = path.rsplit("::").next().unwrap_or_default();
             // Its triggers are known only after all stories are read: `elements::resolve` puts them
             // here.
             Ok(ConditionSection {
@@ -163,7 +163,8 @@ fn parameter_condition(
     let Some(value) = value else {
         return Err(kind.wrong(&format!("there is no parameter or variable {name:?}; declare it")));
     };
-    let [rule, bound] = [kind.text("rule")?, kind.text("value")?];
+    let rule = kind.text("rule")?;
+    let bound = kind.text("value")?;
     let holds = super::catalogs::compare(&rule, value, &bound);
     let sets: Vec<_> = context.sets.iter().filter(|(other, ..)| *other == name).collect();
     if !sets.is_empty() {

@@ -40,8 +40,8 @@ pub(super) fn distance(
 ) -> Result<KeepDistanceSection, ConvertError> {
     action.only(&["DynamicConstraints"])?;
     let of = other(action, "entityRef", own, context)?;
-    let [gap_m, headway_s] = ["distance", "timeGap"].map(|name| action.find_number(name));
-    let (gap_m, headway_s) = (gap_m?, headway_s?);
+    let gap_m = action.find_number("distance")?;
+    let headway_s = action.find_number("timeGap")?;
     if gap_m.is_some() == headway_s.is_some() {
         return Err(action.wrong("write exactly one of distance and timeGap"));
     }
@@ -63,11 +63,12 @@ pub(super) fn distance(
         Some("leadingReferencedEntity") => Some(SideSection::Ahead),
         Some(other) => return Err(action.wrong(&format!("displacement={other:?} is not read"))),
     };
-    let free = action.find_flag("freespace")?;
-    let free = free.ok_or_else(|| action.wrong("the attribute freespace is missing"))?;
-    let continuous = action.find_flag("continuous")?;
-    let continuous =
-        continuous.ok_or_else(|| action.wrong("the attribute continuous is missing"))?;
+    let free = action
+        .find_flag("freespace")?
+        .ok_or_else(|| action.wrong("the attribute freespace is missing"))?;
+    let continuous = action
+        .find_flag("continuous")?
+        .ok_or_else(|| action.wrong("the attribute continuous is missing"))?;
     let mut section = KeepDistanceSection {
         of: context.actor_name(&of),
         gap_m,
@@ -184,7 +185,8 @@ pub(super) fn arrival(
     action.only(&["TargetPositionMaster", "TargetPosition", "FinalSpeed"])?;
     let of = other(action, "masterEntityRef", own, context)?;
     let place = |name: &str| Ok(place_from(&action.need(name)?, context)?.xyz_m);
-    let [at, of_at] = [place("TargetPosition"), place("TargetPositionMaster")];
+    let at = place("TargetPosition");
+    let of_at = place("TargetPositionMaster");
     let tolerance = |name: &str| {
         let tolerance_m = action.find_number(name)?;
         if tolerance_m.is_some_and(|tolerance_m| tolerance_m < 0.0) {

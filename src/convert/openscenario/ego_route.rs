@@ -88,11 +88,12 @@ fn along_lanes(
 fn up_to(points: &[[f64; 3]], point: [f64; 3]) -> Option<Vec<[f64; 3]>> {
     let flat = |point: [f64; 3]| DVec2::new(point[0], point[1]);
     let places = points.windows(2).enumerate().map(|(index, pair)| {
-        let (from, way) = (flat(pair[0]), flat(pair[1]) - flat(pair[0]));
+        let from = flat(pair[0]);
+        let way = flat(pair[1]) - from;
         // The foot of the point on this piece, as a share of its length. `max` is for two equal
         // points, where 0 / 0 would be NaN.
-        let t = (flat(point) - from).dot(way) / way.length_squared().max(1e-12);
-        let t = t.clamp(0.0, 1.0);
+        let share = (flat(point) - from).dot(way) / way.length_squared().max(1e-12);
+        let t = share.clamp(0.0, 1.0);
         ((from + t * way).distance(flat(point)), index, t)
     });
     let places: Vec<(f64, usize, f64)> = places.collect();
@@ -101,7 +102,8 @@ fn up_to(points: &[[f64; 3]], point: [f64; 3]) -> Option<Vec<[f64; 3]>> {
     // The first time that it passes: the road may lead around.
     let (_, index, t) = *places.iter().find(|(beside_m, ..)| *beside_m <= nearest_m + LAP_M)?;
     let mut line = points[..=index].to_vec();
-    let [from, to] = [points[index], points[index + 1]];
+    let from = points[index];
+    let to = points[index + 1];
     line.push([0, 1, 2].map(|axis| from[axis] + t * (to[axis] - from[axis])));
     let length_m: f64 = line.windows(2).map(|pair| flat(pair[0]).distance(flat(pair[1]))).sum();
     (length_m >= SHORTEST_M).then_some(line)

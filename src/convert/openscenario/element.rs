@@ -61,12 +61,10 @@ impl<'a> Element<'a> {
         self.ledger.check((self.source.index, self.source.label), self.node)
     }
 
-    /// Its name.
     pub(super) fn name(&self) -> &'a str {
         self.node.tag_name().name()
     }
 
-    /// The child elements.
     pub(super) fn children(&self) -> impl Iterator<Item = Self> + use<'a> {
         // The iterator owns a copy, so that it borrows nothing of `self`.
         let own = self.clone();
@@ -186,7 +184,7 @@ impl<'a> Element<'a> {
         Ok(attribute.value().trim().to_owned())
     }
 
-    /// An attribute.
+    /// The text of an attribute, which must be there.
     pub(super) fn text(&self, name: &str) -> Result<String, ConvertError> {
         self.find_text(name)?.ok_or_else(|| self.wrong(&format!("the attribute {name} is missing")))
     }

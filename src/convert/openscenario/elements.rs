@@ -24,7 +24,6 @@ pub(super) struct Elements {
     marks: Vec<(String, Draft)>,
 }
 
-/// An event.
 #[derive(Debug, Default)]
 pub(super) struct Event {
     /// `ACTOR/TRIGGER` of its actions, with the names of the actions.
@@ -58,8 +57,9 @@ impl Elements {
             1 => format!("at-{plain}"),
             _ => format!("at-{plain}-{index}"),
         });
-        let name = free.find(|name| !taken(name));
-        let name = name.ok_or_else(|| element.wrong("is there too often; rename some"))?;
+        let name = free
+            .find(|name| !taken(name))
+            .ok_or_else(|| element.wrong("is there too often; rename some"))?;
         let reference = format!("{}/{name}", entity.name);
         self.marks.push((key.clone(), Draft { name, when, then: Vec::new() }));
         Ok(reference)
@@ -191,8 +191,9 @@ fn resolve_condition(when: &mut ConditionSection, elements: &Elements) -> Result
     let [kind, name, line] = [(); 3].map(|()| words.next().unwrap_or_default().to_owned());
     let place = format!("line {line}, <StoryboardElementStateCondition>");
     let phase = when.phase.unwrap_or(PhaseSection::Fired);
-    let parts = elements.afters(&kind, &name, phase, when.delay_s.unwrap_or(0.0));
-    let parts = parts.map_err(|message| ConvertError::new(place, message))?;
+    let parts = elements
+        .afters(&kind, &name, phase, when.delay_s.unwrap_or(0.0))
+        .map_err(|message| ConvertError::new(place, message))?;
     let after = join_all(parts);
     // What else the condition says must hold in addition.
     *when = ConditionSection { after: None, phase: None, delay_s: None, ..when.clone() };
@@ -261,8 +262,8 @@ impl Elements {
         };
         let mut parts = Vec::new();
         for event in events.iter().map(|index| &self.events[*index]) {
-            let triggers = event.triggers.iter();
-            let triggers = triggers.filter(|(_, action)| kind != "action" || action == name);
+            let triggers =
+                event.triggers.iter().filter(|(_, action)| kind != "action" || action == name);
             parts.extend(triggers.map(|(trigger, _)| after(trigger, phase, delay_s)));
             // The mark of an event stands for the actions of the ego. An action with a trigger does
             // not need it.

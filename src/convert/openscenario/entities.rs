@@ -11,7 +11,6 @@ use crate::ConvertError;
 /// Most entities: as many as a scenario has actors, and the ego.
 const ENTITIES: usize = wildcity_sim::limits::ACTORS + 1;
 
-/// Reads the entities.
 pub(super) fn read_entities<'a>(
     section: &Element<'a>,
     context: &mut Context<'a>,

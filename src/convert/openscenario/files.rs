@@ -35,7 +35,6 @@ pub(super) fn read_bytes(path: &Path) -> Result<Vec<u8>, ConvertError> {
     Ok(bytes)
 }
 
-/// Reads a text.
 pub(super) fn read_text(path: &Path) -> Result<String, ConvertError> {
     let bytes = read_bytes(path)?;
     let text = crate::utf8_text(&bytes)

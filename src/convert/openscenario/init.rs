@@ -253,8 +253,8 @@ fn read_other(
         if follow.name() == "AssignRouteAction" {
             let waypoints = waypoints(&follow, context, place_from)?;
             let roads = context.roads.as_ref().ok_or_else(|| follow.wrong("needs the roads"))?;
-            let lanes = lanes_between(&waypoints, roads);
-            let lanes = lanes.map_err(|message| follow.wrong(&message))?;
+            let lanes =
+                lanes_between(&waypoints, roads).map_err(|message| follow.wrong(&message))?;
             if let Some(entity) = context.entities.get_mut(name) {
                 entity.route = lanes;
             }

@@ -187,8 +187,8 @@ fn add_points(lane: &Lane, is_up: bool, arc_m: f64, points: &mut Vec<[f64; 3]>) 
 /// The direction at the end of a lane that is driven up or down.
 fn end_direction(lane: &Lane, is_up: bool) -> Option<DVec3> {
     let tangents = lane.center.tangents();
-    let tangent = if is_up { tangents.last() } else { tangents.first() }?;
-    let tangent = DVec3::new(f64::from(tangent.x), f64::from(tangent.y), 0.0);
+    let end = if is_up { tangents.last() } else { tangents.first() }?;
+    let tangent = DVec3::new(f64::from(end.x), f64::from(end.y), 0.0);
     Some(if is_up { tangent } else { -tangent })
 }
 

@@ -47,7 +47,7 @@ impl Part {
         (Self::Custom, "custom"),
     ];
 
-    /// Its name.
+    /// The name of the part, as messages have it.
     pub fn name(self) -> &'static str {
         Self::ALL.iter().find(|(part, _)| *part == self).map_or("", |(_, name)| name)
     }
@@ -164,7 +164,8 @@ impl Ledger {
         for (index, attribute) in node.attributes().enumerate() {
             let is_read = self.attributes.borrow().contains(&(file.0, node.id(), index));
             if !is_read && !is_harmless(name, attribute.name()) {
-                let [key, value] = [attribute.name(), attribute.value()];
+                let key = attribute.name();
+                let value = attribute.value();
                 let message = format!("{key}={value:?} is not read here; remove the attribute");
                 return Err(ConvertError { message, ..place() });
             }

@@ -167,8 +167,11 @@ fn read_sets(node: roxmltree::Node<'_, '_>) -> Vec<(String, String, String)> {
         let set = node.children().find(|child| child.has_tag_name("SetAction"));
         let value = set.and_then(|set| set.attribute("value")).unwrap_or_default();
         // There is no event around an action of `Init`.
-        let event = node.ancestors().find(|node| node.has_tag_name("Event"));
-        let event = event.and_then(|event| event.attribute("name")).unwrap_or_default();
+        let event = node
+            .ancestors()
+            .find(|node| node.has_tag_name("Event"))
+            .and_then(|event| event.attribute("name"))
+            .unwrap_or_default();
         name.map(|name| (catalogs::plain_parameter(name), value.to_owned(), event.to_owned()))
     });
     actions.collect()
@@ -226,8 +229,11 @@ fn file_from<'a>(
     for story in storyboard.all("Story") {
         story::read_story(&story, &mut context, &mut states)?;
     }
-    let stop = storyboard.find("StopTrigger")?;
-    let stop = stop.map(|stop| stop::read_stop(&stop, &context)).transpose()?.unwrap_or_default();
+    let stop = storyboard
+        .find("StopTrigger")?
+        .map(|stop| stop::read_stop(&stop, &context))
+        .transpose()?
+        .unwrap_or_default();
     let end_s = stop.time_s;
     let ends = elements::resolve(states, stop.groups, &mut context)?;
     // Without a condition, only the time ends the scenario.

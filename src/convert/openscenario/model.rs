@@ -13,9 +13,8 @@ use super::roads::{RoadMap, Spot};
 /// A place with a heading.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Place {
-    /// Position, in metres.
     pub(super) xyz_m: [f64; 3],
-    /// Heading, in radians.
+    /// Heading from x towards y, in radians.
     pub(super) yaw_rad: f64,
     /// Where it is on the roads; `None` beside them or across a lane.
     pub(super) spot: Option<Spot>,
@@ -66,7 +65,6 @@ impl Entity {
     }
 }
 
-/// A trajectory.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Line {
     pub(super) points: Vec<[f64; 3]>,

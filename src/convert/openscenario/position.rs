@@ -17,10 +17,11 @@ pub(super) fn place_from(
             kind.only(&[])?;
             note_tilt(&kind)?;
             let [dx_m, dy_m] = context.shift_m;
-            let [x_m, y_m] = [kind.number("x")? + dx_m, kind.number("y")? + dy_m];
+            let x_m = kind.number("x")? + dx_m;
+            let y_m = kind.number("y")? + dy_m;
             let z_m = kind.find_number("z")?;
-            let mut place =
-                on_roads([x_m, y_m, z_m.unwrap_or(0.0)], kind.number_or_0("h")?, context);
+            let xyz_m = [x_m, y_m, z_m.unwrap_or(0.0)];
+            let mut place = on_roads(xyz_m, kind.number_or_0("h")?, context);
             // Without a height, it is on the road.
             let roads = context.roads.as_ref().filter(|_| z_m.is_none());
             if let Some((roads, at)) =
@@ -94,8 +95,7 @@ fn base_place(kind: &Element<'_>, context: &Context<'_>) -> Result<(String, Plac
     if context.is_in_story && entity.is_some() {
         kind.note(&format!("is relative to where {name:?} is at the start"));
     }
-    let place = entity.and_then(|entity| entity.place);
-    let place = place.ok_or_else(|| {
+    let place = entity.and_then(|entity| entity.place).ok_or_else(|| {
         kind.wrong(&format!("{name:?} has no position before this one; place it first"))
     })?;
     Ok((name, place))
@@ -103,8 +103,9 @@ fn base_place(kind: &Element<'_>, context: &Context<'_>) -> Result<(String, Plac
 
 fn relative_place(kind: &Element<'_>, context: &Context<'_>) -> Result<Place, ConvertError> {
     let (_, base) = base_place(kind, context)?;
-    let [dx, dy, dz] = ["dx", "dy", "dz"].map(|axis| kind.number_or_0(axis));
-    let (dx, dy, dz) = (dx?, dy?, dz?);
+    let dx = kind.number_or_0("dx")?;
+    let dy = kind.number_or_0("dy")?;
+    let dz = kind.number_or_0("dz")?;
     let mut xyz_m = match kind.name() {
         "RelativeObjectPosition" => base.shifted(dx, dy).xyz_m,
         // Along the world's axes, whatever the heading of the entity.
@@ -116,10 +117,12 @@ fn relative_place(kind: &Element<'_>, context: &Context<'_>) -> Result<Place, Co
 
 fn lane_place(kind: &Element<'_>, context: &Context<'_>) -> Result<Place, ConvertError> {
     let roads = roads(kind, context)?;
-    let [s, offset] = [kind.number("s")?, kind.number_or_0("offset")?];
+    let s = kind.number("s")?;
+    let offset = kind.number_or_0("offset")?;
     let lane = kind.whole("laneId")?;
-    let at = roads.place(&kind.text("roadId")?, lane, s, offset);
-    let at = at.map_err(|message| kind.wrong(&message))?;
+    let at = roads
+        .place(&kind.text("roadId")?, lane, s, offset)
+        .map_err(|message| kind.wrong(&message))?;
     lane_facing(kind, at, roads, context)
 }
 

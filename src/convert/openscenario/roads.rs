@@ -53,8 +53,11 @@ impl RoadMap {
         let lanes = self.lanes.get(&(road.to_owned(), lane));
         // The lanes of one id in all sections of the road. Only that of the section at s has a
         // point there.
-        let places = lanes.into_iter().flatten().map(|id| LanePosition { lane: *id, s, offset });
-        let mut places = places.filter(|at| self.network.lane_point(*at).is_some());
+        let mut places = lanes
+            .into_iter()
+            .flatten()
+            .map(|id| LanePosition { lane: *id, s, offset })
+            .filter(|at| self.network.lane_point(*at).is_some());
         places.next().ok_or_else(|| format!("road {road:?} has no lane {lane} at s {s:?}"))
     }
 
@@ -74,9 +77,10 @@ impl RoadMap {
         let length_m = self.road_length_m(road)?;
         let found = self.network.road_by_od_id(road);
         let id = found.ok_or_else(|| format!("the map has no road {road:?}"))?.id();
-        let point = self.network.road_point(RoadPosition { road: id, s, t });
-        let point =
-            point.ok_or_else(|| format!("s is {s:?}, but road {road:?} is {length_m:?} m long"))?;
+        let point = self
+            .network
+            .road_point(RoadPosition { road: id, s, t })
+            .ok_or_else(|| format!("s is {s:?}, but road {road:?} is {length_m:?} m long"))?;
         let heading_rad = self.road_heading_rad(id, s).unwrap_or(0.0);
         Ok((array(point), heading_rad, self.lane_near(array(point))))
     }

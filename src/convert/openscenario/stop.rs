@@ -18,7 +18,6 @@ pub(super) struct Stop<'a> {
     pub(super) groups: Vec<(Element<'a>, ConditionSection)>,
 }
 
-/// Reads a `<StopTrigger>`.
 pub(super) fn read_stop<'a>(
     stop: &Element<'a>,
     context: &Context<'_>,

@@ -95,9 +95,11 @@ fn act_gate(
     context: &mut Context<'_>,
     elements: &mut Elements,
 ) -> Result<Option<String>, ConvertError> {
-    let start = act.find("StartTrigger")?;
-    let start = start.map(|start| trigger_condition(&start, context, true)).transpose()?;
-    let start = start.unwrap_or_default();
+    let start = act
+        .find("StartTrigger")?
+        .map(|start| trigger_condition(&start, context, true))
+        .transpose()?
+        .unwrap_or_default();
     // An act that starts at time 0 needs no mark, because its events need not wait for it.
     let at_once = ConditionSection { time_s: Some(0.0), ..ConditionSection::default() };
     let gate = if start == ConditionSection::default() || start == at_once {
@@ -363,8 +365,9 @@ impl<'a> EventRead<'_, 'a> {
             1 => plain.clone(),
             _ => format!("{plain}-{index}"),
         });
-        let name = free.find(|name| !taken(name));
-        let name = name.ok_or_else(|| kind.wrong("is there too often; rename some events"))?;
+        let name = free
+            .find(|name| !taken(name))
+            .ok_or_else(|| kind.wrong("is there too often; rename some events"))?;
         let reference = format!("{}/{name}", entity.name);
         let mut then = Vec::new();
         if self.is_overriding && act.is_motion() {
@@ -372,8 +375,9 @@ impl<'a> EventRead<'_, 'a> {
             // `names` has the story, the act, the group and, at index 3, the maneuver.
             let key = &self.scope.names[3];
             let maneuver = elements.by_name.get(key).into_iter().flatten();
-            let others = maneuver.filter(|index| **index != self.index);
-            let others = others.flat_map(|index| &elements.events[*index].triggers);
+            let others = maneuver
+                .filter(|index| **index != self.index)
+                .flat_map(|index| &elements.events[*index].triggers);
             let own = format!("{}/", entity.name);
             then.extend(others.filter_map(|(trigger, _)| {
                 let name = trigger.strip_prefix(&own)?;

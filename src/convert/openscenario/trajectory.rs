@@ -129,7 +129,8 @@ fn nurbs(shape: &Element<'_>, context: &Context<'_>) -> Result<Line, ConvertErro
         return Err(shape.wrong(message));
     }
     // Where all of `order` basis functions overlap, which is the domain of the curve.
-    let [from, to] = [knots[order - 1], knots[controls.len()]];
+    let from = knots[order - 1];
+    let to = knots[controls.len()];
     // The polygon of the control points is no shorter than the curve.
     let polygon_m: f64 = controls
         .windows(2)
@@ -139,12 +140,13 @@ fn nurbs(shape: &Element<'_>, context: &Context<'_>) -> Result<Line, ConvertErro
         })
         .sum();
     let count = ((polygon_m / SPACING_M).ceil() as usize).clamp(8, POINTS - 1);
-    let points = (0..=count).map(|index| {
-        let u = from + (to - from) * index as f64 / count as f64;
-        let [x, y, z, weight] = de_boor(&knots, &controls, order, u);
-        [x / weight, y / weight, z / weight]
-    });
-    let points = points.collect();
+    let points = (0..=count)
+        .map(|index| {
+            let u = from + (to - from) * index as f64 / count as f64;
+            let [x, y, z, weight] = de_boor(&knots, &controls, order, u);
+            [x / weight, y / weight, z / weight]
+        })
+        .collect();
     if is_timed {
         shape.note("times of control points are not used");
     }
@@ -156,9 +158,10 @@ fn de_boor(knots: &[f64], controls: &[[f64; 4]], order: usize, u: f64) -> [f64; 
     let degree = order - 1;
     let last = controls.len() - 1;
     // The span of the parameter; the end belongs to the last span that has a length.
-    let span =
-        (degree..=last).rev().find(|span| knots[*span] <= u && knots[*span] < knots[span + 1]);
-    let span = span.unwrap_or(degree);
+    let span = (degree..=last)
+        .rev()
+        .find(|span| knots[*span] <= u && knots[*span] < knots[span + 1])
+        .unwrap_or(degree);
     let mut points: Vec<[f64; 4]> = controls[span - degree..=span].to_vec();
     for level in 1..=degree {
         // From the back, so that `points[index - 1]` is still that of the level before.

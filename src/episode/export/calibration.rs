@@ -21,7 +21,6 @@ const GRID: u32 = 33;
 // 40 for each of the five unknowns: the sums of the fit are then close to integrals over the angle.
 const FITTED_ANGLES: u32 = 200;
 
-/// A calibration.
 pub(super) struct Calibration {
     pub(super) message: foxglove::CameraCalibration,
     /// How far it is off the lens at most, in pixels, within the field of the lens.
@@ -41,7 +40,7 @@ enum Model {
     Pinhole,
     /// k1 to k6, p1 and p2.
     Rational([f64; 6], [f64; 2]),
-    /// k1 to k4.
+    /// Coefficients k1 to k4 of `cv::fisheye`.
     Fisheye([f64; 4]),
 }
 
@@ -53,7 +52,8 @@ impl Calibration {
         let DVec2 { x: fx, y: fy } = nearest.focal_px;
         // Foxglove and OpenCV count pixels from the middle of the first one, this project from its
         // corner.
-        let [cx, cy] = [camera.pinhole.cx - 0.5, camera.pinhole.cy - 0.5];
+        let cx = camera.pinhole.cx - 0.5;
+        let cy = camera.pinhole.cy - 0.5;
         let message = foxglove::CameraCalibration {
             timestamp: Some(timestamp(time_us)),
             width: camera.width_px,
@@ -101,7 +101,8 @@ impl Nearest {
         // With s = θ / θmax and p = (s³, s⁵, s⁷, s⁹), the sum of (r - a s - b·p)² is least where
         // Σs² a + m·b = Σ s r and m a + N b = Σ r p, with m = Σ s p and N = Σ p pᵀ.
         // The normal equations of the linear coefficient, and of the four others.
-        let [mut linear, mut linear_right] = [0.0, 0.0];
+        let mut linear = 0.0;
+        let mut linear_right = 0.0;
         let [mut mixed, mut right] = [DVec4::ZERO; 2];
         let mut normal = DMat4::ZERO;
         for k in 1..=FITTED_ANGLES {

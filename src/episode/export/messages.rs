@@ -1,6 +1,5 @@
 //! Foxglove's messages, as far as episodes fill them. `descriptors.rs` has all of their fields.
 
-/// A time.
 #[derive(Clone, Copy, PartialEq, prost::Message)]
 pub(super) struct Timestamp {
     #[prost(int64, tag = "1")]

@@ -65,7 +65,6 @@ struct Listed {
     images: Vec<ListedImage>,
     /// The folder that names are in, unless the user gives a different one.
     folder: PathBuf,
-    /// As [`ImageList::is_in_scene_axes`].
     is_in_scene_axes: bool,
     warnings: Vec<String>,
 }
@@ -95,6 +94,7 @@ impl ImageList {
         for ListedImage { posed, mask, depth, weight, near, exposure_stops } in images {
             let PosedImage { name, camera, world_from_camera, time_us } = posed;
             let file = image_file(folder, &name)?;
+            // A folder of masks on the command line replaces those that the list names.
             let mask = match (masks, mask) {
                 (Some(masks), _) => Some(mask_file(masks, &name)?),
                 (None, Some(mask)) => Some(folder.join(mask)),
@@ -116,6 +116,8 @@ impl ImageList {
                 held_out: false,
             });
         }
+        // Lists of one capture may differ in order; every n-th image must be the same in all of
+        // them.
         found.sort_by(|a, b| a.name.cmp(&b.name));
         Ok(Self { images: found, is_in_scene_axes, warnings })
     }
@@ -175,6 +177,7 @@ impl ImageList {
 fn read(source: &Path) -> anyhow::Result<Listed> {
     let beside = source.parent().unwrap_or(Path::new("")).to_owned();
     let is_dir = source.is_dir();
+    // A folder with both kinds is read as transforms.json, which also names masks and depths.
     if is_dir && !source.join("transforms.json").is_file() {
         let images = capture::read_colmap(source).map_err(|error| match error {
             CaptureError::NoModel { .. } => anyhow!("{error}; there is no transforms.json either"),
@@ -207,6 +210,7 @@ fn read(source: &Path) -> anyhow::Result<Listed> {
         return Ok(Listed { images, folder, is_in_scene_axes: false, warnings });
     }
     let listed = cameras::read(source)?.into_iter().map(|listed| {
+        // A list of cameras to render has no files: then the camera's name is that of its image.
         let name = listed.image.unwrap_or(listed.name);
         let cameras::ListedCamera {
             camera,

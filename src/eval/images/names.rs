@@ -11,6 +11,8 @@ use super::list::RealImage;
 /// without the digits at its end.
 pub fn camera_names(images: &[&RealImage]) -> Vec<String> {
     let folder = |image: &RealImage| Path::new(&image.name).parent().map(Path::to_owned);
+    // Captures of several cameras have a folder for each, or one folder with files that begin with
+    // the names of the cameras.
     let folders: BTreeSet<Option<PathBuf>> = images.iter().map(|image| folder(image)).collect();
     let name = |image: &&RealImage| {
         let path = Path::new(&image.name);

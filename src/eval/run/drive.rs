@@ -48,13 +48,16 @@ impl Drives {
         let manifest = &self.version.manifest;
         let cameras = manifest.rig.iter().flat_map(|rig| &rig.cameras);
         let mounted = cameras.into_iter().find(|camera| camera.name == camera_name);
+        // world_from_rig = world_from_camera * camera_from_rig.
         let rig = mounted.map(|mounted| *world_from_camera * mounted.rig_from_camera.inverse());
         let at_m = rig.map_or(world_from_camera.position_m, |rig| rig.position_m);
         let places = manifest.trajectories.iter().map(|drive| (drive, drive.nearest(at_m)));
         let (trajectory, place) =
+            // Drives may cross or lie side by side: the image belongs to the nearest one.
             places.min_by(|(_, a), (_, b)| a.distance_m.total_cmp(&b.distance_m))?;
         let drive = trajectory.at_station(place.station_m);
         let beside = || {
+            // Rig axes: x points forward and y to the left.
             let left = drive.rotation * DVec3::Y;
             let beside_m = left.dot(at_m - drive.position_m);
             Pose { position_m: drive.position_m + beside_m * left, ..drive }
@@ -85,6 +88,7 @@ impl DrivePlace<'_> {
             self.station_m + FRAME_M
         };
         let before = self.trajectory.at_station(from_m);
+        // A station beyond an end is that of the end: then the drive is too short for a step.
         let is_moved = before.position_m.distance(self.drive.position_m) > 0.5 * FRAME_M;
         is_moved.then(|| before * self.drive.inverse())
     }

@@ -32,7 +32,6 @@ pub(super) struct Labels {
 }
 
 impl Labels {
-    /// Reads the files.
     pub(super) fn load(
         settings: &Settings,
         source: &OpenScene,
@@ -40,6 +39,8 @@ impl Labels {
         images: &[&RealImage],
     ) -> anyhow::Result<Self> {
         for (option, file) in [("--boxes", &settings.boxes), ("--lidar", &settings.lidar)] {
+            // Both labels are matched by time; without one they would be left out of an image
+            // silently.
             let untimed = images.iter().find(|image| image.time_us.is_none());
             if let (Some(_), Some(image)) = (file, untimed) {
                 anyhow::bail!(
@@ -138,9 +139,11 @@ fn read_lidar(path: &Path) -> anyhow::Result<LidarPoints> {
 fn read_log(path: &Path, images: &[&RealImage], window_us: i64) -> anyhow::Result<LidarPoints> {
     let log = Log::open(path)?;
     let mut times_us: Vec<i64> = images.iter().filter_map(|image| image.time_us).collect();
+    // Sorted, so that each sweep is matched by bisection and not against every image.
     times_us.sort_unstable();
     let is_near = |from_us: i64, to_us: i64| {
         let from_us = from_us.saturating_sub(window_us);
+        // The first time that is not too early is near if it is not too late.
         let first = times_us.partition_point(|time_us| *time_us < from_us);
         times_us.get(first).is_some_and(|time_us| *time_us <= to_us.saturating_add(window_us))
     };
@@ -160,6 +163,8 @@ fn in_world(
     alignment: &Alignment,
 ) -> anyhow::Result<WorldPoints> {
     let drives = source.version().map(|version| &version.manifest.trajectories);
+    // Points in the rig's axes without poses of their own are placed by the first drive of the
+    // twin.
     let drive = drives.and_then(|drives| drives.first()).map(|drive| &drive.keyframes[..]);
     let world = points.in_world(alignment, drive.map(|keys: &[Keyframe]| keys))?;
     ensure!(

@@ -133,6 +133,7 @@ impl<'a> Evaluator<'a> {
         save: Option<Save<'a>>,
     ) -> anyhow::Result<Self> {
         let Scene { source, catalog, own_profile, changes, alignment, backend } = scene;
+        // Of the whole list: with fewer images all may be in one folder, and would get other names.
         let names = camera_names(&list.every(1));
         let named = list.every(1).into_iter().zip(names).step_by(settings.every.max(1));
         let images: Vec<(&RealImage, String)> = named.collect();
@@ -157,6 +158,7 @@ impl<'a> Evaluator<'a> {
         let real: Vec<&RealImage> = images.iter().map(|(image, _)| *image).collect();
         let labels = Labels::load(settings, &source, &alignment, &real)?;
         let networks = Networks::load(settings)?;
+        // Last, because it takes the source and the alignment, which the others borrow.
         let renderer = Renderer { source, own_profile, changes, backend, alignment, maps };
         let profile = renderer.profile(None)?;
         Ok(Self { settings, images, renderer, repairer, drives, labels, networks, profile, save })
@@ -173,6 +175,8 @@ impl<'a> Evaluator<'a> {
         let mut features = Features::default();
         progress(0, count as u64);
         for (at, (image, camera_name)) in self.images.iter().enumerate() {
+            // Only the views of one image are shown, in the middle of the list: a page with all
+            // would be too large to open.
             let is_shown = at == count / 2;
             let scores = self.add(image, camera_name, is_shown, &mut views, &mut features);
             evaluated.push(scores.with_context(|| format!("image {}", image.name))?);
@@ -212,9 +216,8 @@ impl<'a> Evaluator<'a> {
         image: &RealImage,
         is_shown: bool,
     ) -> anyhow::Result<Vec<OffTrajectoryImage>> {
-        let (Some(drives), Some(lens)) = (&self.drives, &compared.lens) else {
-            return Ok(Vec::new());
-        };
+        let Some(drives) = &self.drives else { return Ok(Vec::new()) };
+        let Some(lens) = &compared.lens else { return Ok(Vec::new()) };
         let tools = Tools { renderer: &self.renderer, repairer: self.repairer.as_ref(), drives };
         let on_drive = OnDrive {
             name: &image.name,
@@ -249,6 +252,7 @@ impl<'a> Evaluator<'a> {
             return;
         }
         let with_pictures = evaluated.iter_mut().filter(|image| image.thumbnails.is_some());
+        // One is added at a time, so that removing one is enough.
         if let Some(best) = with_pictures.max_by(|a, b| a.compare(b)) {
             best.thumbnails = None;
         }
@@ -294,6 +298,7 @@ impl Features {
     ) -> anyhow::Result<()> {
         let camera = &compared.view.camera;
         let size_px = [camera.width_px, camera.height_px];
+        // The number of distances is the same for every image, so that only the first one resizes.
         self.off_trajectory.resize_with(drawn.len(), FeatureSet::default);
         for (set, image) in self.off_trajectory.iter_mut().zip(drawn) {
             set.rendered.extend(networks.features(size_px, &image.rendered)?);

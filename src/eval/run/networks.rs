@@ -23,7 +23,6 @@ pub(super) struct FeatureSet {
 }
 
 impl Networks {
-    /// Loads the networks.
     pub(super) fn load(settings: &Settings) -> anyhow::Result<Self> {
         let load = |option: &str, path: &Path, compares: bool| {
             let about = || format!("{option} {}", path.display());
@@ -58,12 +57,14 @@ impl Networks {
         counts: Option<&[bool]>,
     ) -> anyhow::Result<Option<f64>> {
         let Some(network) = &self.lpips else { return Ok(None) };
+        // A copy: other measures need the pixels as they were rendered.
         let mut pixels = image.to_vec();
         for (pixel, _) in counts.into_iter().flatten().enumerate().filter(|(_, counts)| !**counts) {
             pixels[3 * pixel..3 * pixel + 3].copy_from_slice(&truth[3 * pixel..3 * pixel + 3]);
         }
         let values = network.run(&sized(size_px, pixels), Some(&sized(size_px, truth.to_vec())))?;
         ensure!(
+            // Networks are files of the user, and may compute something else.
             values.len() == 1,
             "--lpips: the network gave {} values; a distance is one",
             values.len()

@@ -129,9 +129,11 @@ impl Line {
         // The previous view is rendered first, and this one keeps its nearest recorded image, as in
         // a session.
         let step = place.step_back();
-        let before =
-            step.map(|step| draw(tools, image, place, &|pose| step * moved(pose, moved_m), None));
-        let before = before.transpose()?;
+        // The step is applied after the shift: so the view before is as far beside the drive as
+        // this one, also in a curve.
+        let before = step
+            .map(|step| draw(tools, image, place, &|pose| step * moved(pose, moved_m), None))
+            .transpose()?;
         let kept = before.as_ref().and_then(|before| before.nearest.as_deref());
         let now = draw(tools, image, place, &|pose| moved(pose, moved_m), kept)?;
 
@@ -139,6 +141,7 @@ impl Line {
         let onto_now = |of: &dyn Fn(&Drawn) -> Vec<u8>| match &before {
             Some(before) => {
                 let back = into(lens, &now.view, &now.rendered, before, of(before));
+                // NaN if no pixel can be compared: 0 would say that nothing flickers.
                 flicker(&of(&now), &back.image.rgb8, &back.valid).unwrap_or(f64::NAN)
             }
             None => f64::NAN,
@@ -157,6 +160,7 @@ impl Line {
             anyhow::Ok((scores, back.image.rgb8))
         };
         let (rendered, mut came_back) = scores(&|drawn| drawn.rendered.rgb8.clone())?;
+        // The picture that is brought back is the one that a session would deliver.
         let mut repaired = None;
         if now.repaired.is_some() {
             let of = |drawn: &Drawn| drawn.repaired.clone().unwrap_or_default();
@@ -204,6 +208,7 @@ fn draw(
     let view = View::new(image.view.camera, moved(&image.view.world_from_camera));
     let world_from_rig = moved(&place.world_from_rig);
     let mut rendered = renderer.render(&view, image.profile)?;
+    // Before the repair: a model may take the trust as an input.
     rendered.trust = drives.trust(&world_from_rig, &view, &rendered);
     let of = OfflineView {
         camera: image.camera,
@@ -216,6 +221,7 @@ fn draw(
     let repair = |repairer: &Repairer| repairer.repair(renderer, &of, image.profile);
     let (mut repaired, nearest) =
         repairer.map(repair).transpose()?.map(|it| (it.rgb8, it.nearest)).unzip();
+    // After the repair, which works in the exposure of the twin.
     expose(image.exposure_stops, &mut rendered, &mut repaired);
     Ok(Drawn { view, rendered, repaired, nearest: nearest.flatten() })
 }

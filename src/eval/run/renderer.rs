@@ -35,6 +35,7 @@ impl Renderer {
     /// How an image is rendered: `near` of the list overrides the scene's, and the changes
     /// both.
     pub(super) fn profile(&self, near: Option<f64>) -> anyhow::Result<RenderProfile> {
+        // The changes come last: what the user sets holds for every image.
         let near = near.unwrap_or(self.own_profile.near);
         (self.changes)(RenderProfile { near, ..self.own_profile })
     }
@@ -48,6 +49,7 @@ impl Renderer {
         let scene = self.source.scene(&views, profile)?;
         let pixels = view.camera.pixels();
         let map =
+            // A map that is not needed is empty, and costs neither memory nor time.
             |is_needed: bool, values: usize| vec![0.0; usize::from(is_needed) * values * pixels];
         let mut image = RenderedImage {
             rgb8: vec![0; 3 * pixels],

@@ -28,7 +28,6 @@ pub(super) struct Repairer {
     cache: ReferenceCache,
 }
 
-/// A repaired image.
 pub(super) struct Repaired {
     pub(super) rgb8: Vec<u8>,
     /// Name of the nearest recorded image, if the model saw it.
@@ -61,8 +60,13 @@ impl Repairer {
         let name = &model.manifest().name;
         let references = match source {
             OpenScene::Twin(resident) => {
-                let cameras = resident.version.manifest.rig.as_ref().map(|rig| &rig.cameras[..]);
-                let cameras = cameras.unwrap_or_default();
+                let cameras = resident
+                    .version
+                    .manifest
+                    .rig
+                    .as_ref()
+                    .map(|rig| &rig.cameras[..])
+                    .unwrap_or_default();
                 let catalog = catalog.context("a twin is in a catalog")?.clone();
                 let references =
                     OfflineReferences::open(resident.clone(), catalog, cameras, held_out)?;

@@ -47,6 +47,7 @@ impl Evaluator<'_> {
 
     fn save_file(&self, folder: &str, name: &str, png: &[u8]) -> anyhow::Result<()> {
         let Some(save) = self.save else { return Ok(()) };
+        // Names of a list may contain `..`: a saved file must stay in its folder.
         let name = picture::inside(name).with_extension("png");
         save(&std::path::Path::new(folder).join(name), png)
     }

@@ -109,6 +109,7 @@ pub(super) fn compare(
     for (done, sample) in samples.iter().enumerate() {
         on_progress(done as u64, all as u64);
         let camera = &sample.image.camera;
+        // `done` is less than `all`, so that this is 0, 1 or 2.
         let third = 3 * done / all;
         let mounted = &log.rig.cameras[log.camera_index(camera)?];
         let sums = sums.entry(camera.clone()).or_default();
@@ -189,6 +190,8 @@ impl Sums {
             let late_us = step * STEP_US;
             let places = points.iter().map(|point| point.world_m(fit.projection.poses, late_us));
             let values = places.filter_map(|world_m| fit.edges.at(fit.place(world_m)?));
+            // `images` has counted this image already: what matters is only that neighbours
+            // alternate.
             let (sum, count) = self.late[self.images % 2].entry(late_us).or_default();
             for value in values {
                 *sum += value;
@@ -212,8 +215,10 @@ impl Sums {
     }
 
     fn finish(self, camera: String) -> Alignment {
+        // Two measurements that share no image: what only one of them shows is chance.
         let halves = [curve([&self.late[0]]), curve([&self.late[1]])];
         let whole = curve(&self.late);
+        // The peak of a few points may be chance.
         let is_enough = self.images >= LEAST_IMAGES && self.edges >= LEAST_EDGES;
         let lidar_late_ms = peak(&whole).filter(|ms| is_enough && are_near(&halves, *ms));
         let [first, _, last] = self.shifts.map(|sums| fits(&sums));
@@ -253,6 +258,7 @@ fn are_near(halves: &[Vec<[f64; 2]>; 2], late_ms: f64) -> bool {
 /// at an end.
 fn peak(curve: &[[f64; 2]]) -> Option<f64> {
     let best = (0..curve.len()).max_by(|a, b| curve[*a][1].total_cmp(&curve[*b][1]))?;
+    // At an end of the curve the true peak may be beyond what was tried.
     let before = curve.get(best.checked_sub(1)?)?;
     let after = curve.get(best + 1)?;
     let [at, fit] = curve[best];
@@ -299,6 +305,7 @@ fn drift(first: &Fits, last: &Fits) -> Option<f64> {
 fn shrunk(log: &Log, sample: &Sample) -> Result<RgbImage, LogError> {
     let image = read_image(log, sample)?;
     let width = image.width().min(WIDTH_PX);
+    // Rounded up, so that a very wide image keeps a row.
     let height = (u64::from(image.height()) * u64::from(width)).div_ceil(image.width().into());
     Ok(image.resize_exact(width, height as u32, FilterType::Triangle).into_rgb8())
 }

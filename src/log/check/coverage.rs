@@ -45,6 +45,7 @@ impl<'a> Coverage<'a> {
 
     pub(super) fn add(&mut self, row: &ImageRow) {
         let station_m = self.stations.at(row.time_us);
+        // Looked up first, so that only the first row of a camera copies its name.
         if !self.cameras.contains_key(&row.camera) {
             let coverage = CameraCoverage::new(row.camera.clone());
             self.cameras.insert(row.camera.clone(), Along { last_m: 0.0, coverage });
@@ -66,7 +67,9 @@ impl<'a> Coverage<'a> {
     pub(super) fn finish(self) -> Vec<CameraCoverage> {
         let length_m = self.stations.length_m();
         let finished = self.cameras.into_values().map(|Along { last_m, mut coverage }| {
+            // The rest of the drive behind the last image is without one, too.
             coverage.longest_m = coverage.longest_m.max(length_m - last_m);
+            // A camera is listed with its first image, so this does not divide by 0.
             coverage.spacing_m = length_m / coverage.images as f64;
             coverage
         });

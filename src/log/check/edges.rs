@@ -47,6 +47,7 @@ impl EdgeMap {
 /// The largest difference of each pixel to its eight neighbours.
 fn gradients(gray: &[u8], width: usize, height: usize) -> Vec<f32> {
     let mut values = vec![0.0; gray.len()];
+    // Pixels of the border lack neighbours: they keep 0, no edge.
     for row in 1..height.saturating_sub(1) {
         for column in 1..width.saturating_sub(1) {
             let at = row * width + column;
@@ -62,6 +63,8 @@ fn gradients(gray: &[u8], width: usize, height: usize) -> Vec<f32> {
 /// Lets each value decay into the pixels around it: one pass from the top left and one from the
 /// bottom right reach all eight directions.
 fn spread(values: &mut [f32], width: usize, height: usize) {
+    // A step from the side of the image leads to its other side. Nothing is an edge there, and what
+    // has decayed into the border counts little beyond it.
     let forward = |at: usize| [1, width - 1, width, width + 1].map(|step| at.checked_sub(step));
     for at in 0..width * height {
         let before = forward(at).into_iter().flatten().map(|other| DECAY * values[other]);
@@ -82,9 +85,13 @@ pub(super) fn lidar_edges(ranges_m: &[f32], ring: Option<&[u16]>) -> Vec<bool> {
     for at in 0..ranges_m.len() {
         let laser = ring.map_or(0, |ring| ring[at]);
         let Some(before) = last.insert(laser, at) else { continue };
+        // A point without a return may be NaN: then no comparison below holds, and nothing is an
+        // edge.
         let (near, far) = if ranges_m[before] < ranges_m[at] { (before, at) } else { (at, before) };
         let (share, least_m) = LEAP;
         if ranges_m[far] - ranges_m[near] > least_m.max(share * ranges_m[near]) {
+            // The nearer one is at the border of an object; the farther one is anywhere on the
+            // background.
             is_edge[near] = true;
         }
     }

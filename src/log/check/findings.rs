@@ -72,6 +72,7 @@ pub(super) fn find(log: &Log, report: &Report, missing: &Missing) -> Vec<Finding
 
 fn find_gaps(report: &Report, found: &mut Findings) {
     for Stream { sensor, gaps, missing, longest, .. } in &report.streams {
+        // Only what exceeds the limit of a gap is in this list.
         let Some(worst) = longest.first() else { continue };
         let [from_s, length_s] = [worst.from_us as f64, worst.length_us as f64].map(|us| us / 1e6);
         found.add(
@@ -103,6 +104,7 @@ fn find_path(report: &Report, found: &mut Findings) {
 
 fn find_coverage(coverage: &CameraCoverage, found: &mut Findings) {
     let CameraCoverage { camera, images, unplaced, longest_m, .. } = coverage;
+    // A few images before the first pose are usual; if most have none, the clocks do not match.
     let level = if 2 * unplaced > *images { Level::Error } else { Level::Warning };
     found.add_if(*unplaced > 0, level, || {
         format!(
@@ -153,6 +155,7 @@ fn find_gps(report: &Report, found: &mut Findings) {
 fn find_lacks(log: &Log, report: &Report, found: &mut Findings) {
     let has = |kind: &str| report.streams.iter().any(|stream| stream.sensor.starts_with(kind));
     let all = |masks: fn(&CameraCoverage) -> usize| {
+        // Without any image this is true: then the lack of images is said, and not that of masks.
         report.coverage.iter().all(|camera| masks(camera) == camera.images)
     };
     let lacks = [
@@ -173,6 +176,7 @@ fn find_lacks(log: &Log, report: &Report, found: &mut Findings) {
         (!all(|one| one.ground_masks), "not all images have a mask of the ground"),
     ];
     for (index, (is_lacking, text)) in lacks.into_iter().enumerate() {
+        // The first of the list is the one that no twin can do without.
         let level = if index == 0 { Level::Error } else { Level::Note };
         found.add_if(is_lacking, level, || text.to_owned());
     }

@@ -95,6 +95,7 @@ pub fn check(
     let mut tables = Tables::read(log, &poses)?;
     let samples = Samples::choose(log, &tables.image_counts, settings.images_per_camera)?;
     let compared = alignment::compare(log, &poses, samples, on_progress)?;
+    // Poses are the first row of the page, because everything else is placed by them.
     tables.streams.insert(0, stream::measure("poses", log.pose_rows()?)?);
     let gps = log.gps()?.map(|rows| path::compare_fixes(log, &poses, rows)).transpose()?.flatten();
     let map = log.map()?;
@@ -158,6 +159,8 @@ impl Tables {
             tables.read_sweeps(log, rows)?;
         }
         if let Some(rows) = log.tracks()? {
+            // Objects come and go, so that gaps in their tracks mean nothing: only their number is
+            // kept.
             let counters = stream::measure_keys(rows, |_| Ok(()))?;
             tables.tracks = Some(counters.len());
         }
@@ -178,6 +181,7 @@ impl Tables {
     ) -> Result<(), LogError> {
         let mut coverage = Coverage::new(poses);
         let counters = stream::measure_keys(rows, |row: &ImageRow| {
+            // A camera that the rig lacks makes the log unusable: it is an error and not a finding.
             log.camera_index(&row.camera)?;
             let masks = [&row.mask, &row.ground_mask, &row.sky_mask];
             for file in masks.into_iter().flatten().chain([&row.file]) {
@@ -194,6 +198,7 @@ impl Tables {
 
     fn read_sweeps(&mut self, log: &Log, rows: Rows<SweepRow>) -> Result<(), LogError> {
         let counters = stream::measure_keys(rows, |row: &SweepRow| {
+            // As a camera that the rig lacks: without a mount no point can be placed.
             log.rig_from_lidar(&row.lidar)?;
             self.missing.look(&log.path(&row.file), &row.file);
             Ok(())

@@ -73,8 +73,10 @@ impl PathReport {
         // A sum of nothing is -0, which would be printed.
         let long = keys.windows(2).map(gap_s).filter(|s| *s > largest_s);
         let standing = keys.windows(2).zip(&speeds).filter(|(_, speed)| **speed < 0.1);
+        // There is at least one pose, so the step is at least 1.
         let step = keys.len().div_ceil(DRAWN);
         let last = keys.len() - 1;
+        // The last pose is drawn whatever the step is, or the path would end early.
         let drawn = (0..keys.len()).step_by(step).chain([last]);
         let point = |at: usize| keys[at].world_from_rig.position_m.truncate().to_array();
         Self {
@@ -122,6 +124,8 @@ fn leaps_us(keys: &[Keyframe], speeds: &[f64]) -> Vec<i64> {
         let around = [at.checked_sub(1), Some(at + 1)].into_iter().flatten();
         let beside = around.filter_map(|other| speeds.get(other)).copied();
         let fastest = beside.fold(f64::NEG_INFINITY, f64::max);
+        // Of two poses the only step has no neighbour to compare with, and `fastest` is still
+        // infinite.
         fastest.is_finite() && speeds[*at] > 2.0 * fastest + LEAP_M_PER_S
     };
     (0..speeds.len()).filter(is_leap).map(|at| keys[at + 1].time_us).collect()
@@ -151,7 +155,9 @@ pub(super) fn compare_fixes(
     }
     let mean = |part: &[DVec3]| part.iter().sum::<DVec3>().truncate() / part.len() as f64;
     let offset = mean(&offsets);
+    // Rounded up: of few fixes a tenth is at least one, and a mean of none would be NaN.
     let tenth = fixes.div_ceil(10);
+    // A mean of many, because a single fix is off by metres.
     let drift = mean(&offsets[fixes - tenth..]) - mean(&offsets[..tenth]);
     let off_m = offsets.iter().map(|one| one.truncate().distance(offset));
     Ok(Some(GpsReport {

@@ -46,6 +46,7 @@ impl Projection<'_> {
         // The row depends on the time, and the time on the row: each step is ten times closer.
         for _ in 0..SHUTTER_STEPS {
             let fraction = shutter.direction.fraction(shown.0, &self.mounted.camera);
+            // `time_us` is when the last row was exposed, so that earlier ones are before it.
             let before_us = (1.0 - fraction) * shutter.duration_us as f64;
             let time_us = self.time_us.saturating_sub(before_us.round() as i64);
             shown = self.project_at(world_m, time_us)?;
@@ -78,11 +79,13 @@ pub(super) fn rig_points(
 ) -> Result<Vec<RigPoint>, crate::error::LogError> {
     let sweep = log.points(row)?;
     let ranges: Vec<f32> =
+        // From the LiDAR itself, before the mount: leaps of the range are seen from there.
         sweep.points_m.iter().map(|[x, y, z]| (x * x + y * y + z * z).sqrt()).collect();
     let is_edge = super::edges::lidar_edges(&ranges, sweep.ring.as_deref());
     let placed = sweep.on_rig(row, log.rig_from_lidar(&row.lidar)?);
     let mut points = Vec::new();
     for (at, (time_us, rig_m)) in placed.enumerate() {
+        // NaN, a point without a return, is in no range.
         if (NEAR_M..=REACH_M).contains(&ranges[at]) {
             points.push(RigPoint { rig_m, time_us, is_edge: is_edge[at] });
         }

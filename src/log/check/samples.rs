@@ -49,6 +49,7 @@ impl Samples {
     ) -> Result<Self, LogError> {
         let mut samples: Vec<Sample> = Vec::new();
         let Some(images) = log.images()? else { return Ok(Self { samples }) };
+        // Without LiDAR there is nothing to compare, and no image needs to be chosen.
         let Some(sweeps) = log.sweeps()? else { return Ok(Self { samples }) };
         let mut seen: BTreeMap<String, usize> = BTreeMap::new();
         super::for_each(images, |image| {
@@ -67,6 +68,8 @@ impl Samples {
             }
             let from_us = sweep.time_us.saturating_sub(NEAR_US);
             let to_us = sweep.until_us.saturating_add(NEAR_US);
+            // The rows of a table are in order of time, and so are the samples that were taken from
+            // them.
             let first = samples.partition_point(|sample| sample.image.time_us < from_us);
             let near = samples[first..].iter_mut();
             for sample in near.take_while(|sample| sample.image.time_us <= to_us) {
@@ -102,6 +105,7 @@ impl ReadImage {
     /// The colour at a place, in pixels of the camera.
     pub(crate) fn color(&self, at_px: DVec2) -> [u8; 3] {
         let [column, row] = (at_px * self.scale).to_array().map(|place| place as u32);
+        // Scaling can round a place at the right or lower edge to the size of the file itself.
         let column = column.min(self.image.width() - 1);
         self.image.get_pixel(column, row.min(self.image.height() - 1)).0
     }

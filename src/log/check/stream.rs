@@ -73,6 +73,7 @@ impl Columns {
     fn add(&mut self, since_us: u64) {
         self.width_us = self.width_us.max(1);
         while since_us / self.width_us >= COLUMNS as u64 {
+            // Twice the width: two old columns are one new column, and an odd last one stays alone.
             let halved = self.counts.chunks(2).map(|pair| pair.iter().sum()).collect();
             self.counts = halved;
             self.width_us *= 2;
@@ -93,6 +94,7 @@ impl StreamCounter {
         let first_us = *self.first_us.get_or_insert(time_us);
         self.columns.add(time_us.abs_diff(first_us));
         if let Some(from_us) = self.last_us.replace(time_us) {
+            // Unsigned: the times of a file are any 64-bit numbers.
             let length_us = time_us.abs_diff(from_us);
             *self.bins.entry(bin(length_us as f64)).or_default() += 1;
             self.keep(Gap { from_us, length_us });
@@ -110,10 +112,13 @@ impl StreamCounter {
 
     pub(super) fn finish(self, sensor: String) -> Stream {
         let period_us = self.median_us();
+        // Without a period nothing exceeds the limit, and `lost` below is never called.
         let limit_us = period_us.map_or(f64::INFINITY, |period_us| GAP_TIMES * period_us);
         let gap_bins = self.bins.iter().filter(|(at, _)| middle_us(**at) > limit_us);
         let lost = |(at, count): (&i32, &usize)| {
             let periods = middle_us(*at) / period_us.unwrap_or(1.0);
+            // A gap of two periods lacks one row. From 1.5 periods on, it is rounded to two at
+            // least.
             count * (periods.round() as usize).saturating_sub(1)
         };
         let is_gap = |gap: &Gap| gap.length_us as f64 > limit_us;
@@ -131,6 +136,7 @@ impl StreamCounter {
 
     /// The median period; `None` with fewer than two rows.
     fn median_us(&self) -> Option<f64> {
+        // There is one period less than rows.
         let half = self.rows.checked_sub(1)? / 2;
         let mut before = 0;
         let median = self.bins.iter().find(|(_, count)| {
@@ -143,6 +149,8 @@ impl StreamCounter {
 
 /// The bin of a period, in microseconds.
 fn bin(period_us: f64) -> i32 {
+    // Equal widths on a logarithmic scale are equal shares: one bin is one per cent, whatever the
+    // rate of the sensor. Two rows at one time have no logarithm, and count as 1 µs.
     (BINS_PER_E * period_us.max(1.0).ln()).round() as i32
 }
 

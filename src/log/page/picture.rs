@@ -36,6 +36,8 @@ pub(super) fn jpeg(sample: &SampledImage) -> Result<Vec<u8>, LogError> {
 /// From red over yellow, green and cyan to blue; the root spreads what is near.
 fn color(range_m: f32) -> [u8; 3] {
     let hue = 4.0 * (range_m / FAR_M).clamp(0.0, 1.0).sqrt();
+    // On this scale red is 0, green 2 and blue 4: a channel is full within 1 of its own place and
+    // falls to nothing at 2, as around the circle of hues.
     let ramp = |middle: f32| (255.0 * (2.0 - (hue - middle).abs()).clamp(0.0, 1.0)) as u8;
     [ramp(0.0), ramp(2.0), ramp(4.0)]
 }

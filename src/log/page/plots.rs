@@ -86,6 +86,7 @@ fn draw_timing(streams: &[Stream], [from_s, to_s]: [f64; 2], text: &mut String) 
         .margin(8)
         .x_label_area_size(30)
         .y_label_area_size(130)
+        // Downwards, so that the first sensor is on top; a single row has a range of time, too.
         .build_cartesian_2d(from_s..to_s.max(from_s + 1e-3), f64::from(count)..0.0)?;
     chart.configure_mesh().disable_mesh().disable_y_axis().x_desc("s").label_style(LABEL).draw()?;
     for (index, stream) in streams.iter().enumerate() {
@@ -138,6 +139,7 @@ fn draw_curves(report: &Report, text: &mut String) -> Drawn {
     let fits = points.map(|[_, fit]| *fit);
     let (low, high) =
         fits.fold((f64::INFINITY, 0.0_f64), |(low, high), fit| (low.min(fit), high.max(fit)));
+    // Without any curve `low` is still infinite.
     let low = low.min(high);
     let area = SVGBackend::with_string(text, (WIDTH_PX, 320)).into_drawing_area();
     area.fill(&WHITE)?;
@@ -145,6 +147,8 @@ fn draw_curves(report: &Report, text: &mut String) -> Drawn {
         .margin(8)
         .x_label_area_size(30)
         .y_label_area_size(60)
+        // The differences that are tried, in milliseconds; above, a margin, so that a level curve
+        // has a range as well.
         .build_cartesian_2d(-100.0..100.0, low..high + 0.01)?;
     chart.configure_mesh().x_desc("LiDAR late, ms").y_desc("fit").label_style(LABEL).draw()?;
     for (index, one) in report.alignment.iter().enumerate() {

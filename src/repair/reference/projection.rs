@@ -37,7 +37,7 @@ enum Lens {
     Table(Table),
 }
 
-/// Pixels of directions.
+/// Pixels of directions on a grid, for lenses other than the pinhole.
 #[derive(Debug)]
 struct Table {
     /// Cells per unit of the stereographic plane, which has `CELLS` / 2 cells in each direction.
@@ -139,8 +139,10 @@ impl Table {
             if !is_within || !is_wanted {
                 continue;
             }
-            let [left, top] = [column as usize, row as usize];
-            let [x, y] = [column - left as f32, row - top as f32];
+            let left = column as usize;
+            let top = row as usize;
+            let x = column - left as f32;
+            let y = row - top as f32;
             // A row has one node more than it has cells; `last` is excluded above, so that
             // node + 1 exists.
             let first = top * (CELLS + 1) + left;

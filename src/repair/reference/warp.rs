@@ -261,7 +261,9 @@ fn best(
         let mut points = Points { x: zero, y: zero, z: zero, distance: zero };
         let mut similarity = zero;
         for (lane, similarity) in similarity.iter_mut().enumerate() {
-            let [x, y, z] = [from.x[lane], from.y[lane], from.z[lane]];
+            let x = from.x[lane];
+            let y = from.y[lane];
+            let z = from.z[lane];
             // The ray from the view's camera in the reference's axes, and the point there.
             let ray_x = m[0] * x + m[1] * y + m[2] * z;
             let ray_y = m[3] * x + m[4] * y + m[5] * z;

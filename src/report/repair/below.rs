@@ -40,7 +40,7 @@ pub struct RecommendedBelow {
     pub model: String,
     /// Value for `repair.below` of a session; `None` if repair is not recommended.
     pub below: Option<f64>,
-    /// Value for `repair.above`.
+    /// Value for `repair.above` of a session.
     pub above: Option<f64>,
     /// Why no threshold is recommended.
     #[serde(rename = "unmet")]

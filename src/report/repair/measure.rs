@@ -89,9 +89,9 @@ pub fn measure(
     benchmark: &RepairBenchmark<'_>,
     progress: &mut dyn FnMut(usize, usize),
 ) -> Result<RepairReport, ReportError> {
-    let drive = benchmark.resident.version.manifest.trajectories.first();
+    let first = benchmark.resident.version.manifest.trajectories.first();
     // Without a drive there is no "beside".
-    let drive = drive.ok_or(ReportError::NoDrive)?;
+    let drive = first.ok_or(ReportError::NoDrive)?;
     let cameras = benchmark.sampling.cameras(benchmark.cameras)?;
     let mut measurement = RepairMeasurement::new(benchmark, &cameras)?;
     let samples = measurement.samples(drive, progress)?;
@@ -147,7 +147,7 @@ struct RepairMeasurement<'a> {
 
 /// The images of a camera in one frame.
 struct KindImages {
-    /// Pixels, by kind.
+    /// Red, green and blue of 8 bits, by kind.
     rgb8: Vec<Vec<u8>>,
     /// Times of the repair, by kind.
     repair_ms: Vec<RepairMs>,
@@ -161,17 +161,17 @@ impl<'a> RepairMeasurement<'a> {
         cameras: &'a [RigCamera],
     ) -> Result<Self, ReportError> {
         let RepairBenchmark { resident, catalog, .. } = *benchmark;
-        let coverage = TrainingCoverage::new(&resident.version.manifest);
-        let coverage = coverage.ok_or(ReportError::NoDrive)?;
+        let coverage =
+            TrainingCoverage::new(&resident.version.manifest).ok_or(ReportError::NoDrive)?;
         // References are read as a session does it, without a session.
         let offline = OfflineReferences::open(resident.clone(), catalog.clone(), cameras, &[])?;
         // Before the first image: a model that does not fit would fail after minutes.
         benchmark.models.iter().try_for_each(|model| offline.check(model, cameras))?;
         // Tables of 513 x 513 directions: once per camera and not per image.
-        let optics = |camera: &RigCamera| {
+        let optics_of_one = |camera: &RigCamera| {
             (Arc::new(Projection::from_camera(&camera.camera)), Rays::from_camera(&camera.camera))
         };
-        let optics = cameras.iter().map(optics).collect();
+        let optics = cameras.iter().map(optics_of_one).collect();
         Ok(Self { benchmark, cameras, offline, coverage, optics, read: 0, read_ms: 0.0 })
     }
 
@@ -249,7 +249,8 @@ impl<'a> RepairMeasurement<'a> {
                 let view = &station.views[frame][camera];
                 image.trust = self.coverage.trust(pose, view, &image.opacity).value;
             }
-            let [now, before] = [&now[camera], &before[camera]];
+            let now = &now[camera];
+            let before = &before[camera];
             // This frame first: references that it reads are in memory for the earlier one.
             let images = self.repair_all_kinds(station, 0, camera, now)?;
             let images_before = self.repair_all_kinds(station, 1, camera, before)?;
@@ -299,9 +300,9 @@ impl<'a> RepairMeasurement<'a> {
         resident: &Arc<Resident>,
         views: &[View],
     ) -> Result<(Vec<RenderedImage>, f64), ReportError> {
-        let needs_normals = |model: &Arc<Model>| model.needs(InputRole::Normals);
+        let reads_normals = |model: &Arc<Model>| model.needs(InputRole::Normals);
         // Normals take time, and only some models read them.
-        let needs_normals = self.benchmark.models.iter().any(needs_normals);
+        let needs_normals = self.benchmark.models.iter().any(reads_normals);
         let profile = &resident.version.manifest.profile;
         let scene = resident.scene(&wildcity_session::viewpoints(views), profile)?;
         let empty = |view: &View| {

@@ -7,7 +7,7 @@ use super::below::{Below, RecommendedBelow};
 use super::row::{ImageKind, RepairRow};
 use wildcity_session::limits::FRAME_M;
 
-/// The section.
+/// The section of the page about the repair.
 pub fn section(report: &RepairReport) -> Markup {
     html! {
         h2 { "Repair: error against run time" }

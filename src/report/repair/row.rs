@@ -30,7 +30,7 @@ pub struct RepairMs {
 }
 
 impl RepairMs {
-    /// The sum.
+    /// The sum of all parts, in milliseconds.
     pub fn total(&self) -> f64 {
         self.warp + self.model + self.merge
     }

@@ -15,7 +15,7 @@ pub mod bounds {
     pub const LONGITUDINAL_MPS2: [f64; 2] = [-4.05, 2.40];
     /// Lateral acceleration, in m/s².
     pub const LATERAL_MPS2: f64 = 4.89;
-    /// Jerk, in m/s³.
+    /// Largest magnitude of the jerk, in m/s³.
     pub const JERK_MPS3: f64 = 8.37;
     /// Longitudinal jerk, in m/s³.
     pub const LONGITUDINAL_JERK_MPS3: f64 = 4.13;

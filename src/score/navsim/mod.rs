@@ -88,7 +88,6 @@ pub struct Submetrics {
 }
 
 impl Submetrics {
-    /// All ones.
     pub const PERFECT: Self = Self {
         nc: 1.0,
         dac: 1.0,
@@ -161,9 +160,9 @@ pub fn pdm(record: &DriveRecord) -> Score {
 
 /// The rules over each whole 4 s; none without a map, actors, and samples 0.1 s apart.
 fn rules_as_driven(record: &DriveRecord) -> Vec<Rules> {
-    let (Some(map), Some(tracks), Some(shape)) = (&record.map, &record.tracks, record.shape) else {
-        return Vec::new();
-    };
+    let Some(map) = &record.map else { return Vec::new() };
+    let Some(tracks) = &record.tracks else { return Vec::new() };
+    let Some(shape) = record.shape else { return Vec::new() };
     if !record.is_driven || record.dt_us != 100_000 {
         return Vec::new();
     }

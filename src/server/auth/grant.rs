@@ -142,7 +142,6 @@ impl Role {
         self == role || self == Self::Admin || (self == Self::Push && role == Self::Drive)
     }
 
-    /// Every role.
     pub(super) const ALL: [Self; 4] = [Self::Metrics, Self::Drive, Self::Push, Self::Admin];
 
     /// The role of this name.

@@ -183,8 +183,8 @@ mod tests {
         std::fs::remove_file(&path).unwrap();
         assert_eq!(tokens.read_again().unwrap_err().1.location, "the file");
         // Tokens that came from no file stay as they are.
-        let parsed = br#"{"tokens": [{"name": "a", "role": "push", "token": "0123456789abcdef"}]}"#;
-        let parsed = CurrentTokens::new(Tokens::parse(parsed).unwrap());
+        let text = br#"{"tokens": [{"name": "a", "role": "push", "token": "0123456789abcdef"}]}"#;
+        let parsed = CurrentTokens::new(Tokens::parse(text).unwrap());
         assert_eq!(parsed.read_again().unwrap(), None);
     }
 }

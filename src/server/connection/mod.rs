@@ -234,9 +234,10 @@ impl Connection {
                 if (first..=next).contains(&seq) {
                     return Ok(());
                 }
-                let repeated = last.as_ref().map(|last| last.seq);
-                let repeated =
-                    repeated.map_or(String::new(), |last| format!(", or repeat request {last}"));
+                let repeated = last
+                    .as_ref()
+                    .map(|last| last.seq)
+                    .map_or(String::new(), |last| format!(", or repeat request {last}"));
                 if first == next {
                     format!("the next request is {next}{repeated}")
                 } else {

@@ -46,9 +46,10 @@ impl Connection {
     pub(super) async fn delivered(&mut self, seq: u64, answer: Answer) -> Result<Answer, Fault> {
         // Texts stay on the socket: they are short, and say where in the memory the rest is.
         let memory = self.memory.as_mut().filter(|memory| memory.is_open());
-        let (Some(memory), false) = (memory, matches!(answer, Answer::Text(_))) else {
+        let Some(memory) = memory else { return Ok(answer) };
+        if matches!(answer, Answer::Text(_)) {
             return Ok(answer);
-        };
+        }
         match memory.write(&self.state.engine, &answer).await {
             Ok(place) => {
                 self.state.metrics.shared_memory_bytes.inc_by(place.bytes);

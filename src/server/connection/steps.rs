@@ -39,8 +39,8 @@ impl Connection {
         // name occurs once, which the conversion has checked.
         let mut slots: Vec<_> = self.slots.iter_mut().map(Some).collect();
         let carried_out = steps.into_iter().map(|SessionStep { session: name, step: asked }| {
-            let slot = open.iter().position(|known| *known == name);
-            let slot = slot.and_then(|slot| slots[slot].take());
+            let slot =
+                open.iter().position(|known| *known == name).and_then(|slot| slots[slot].take());
             let open = &open;
             async move {
                 let result = async {
@@ -49,13 +49,13 @@ impl Connection {
                         || Fault::NotOnConnection { name: name.clone(), open: open.clone() };
                     let slot = slot.ok_or_else(unknown)?;
                     let session = slot.session.as_mut().ok_or(NO_SESSION)?;
-                    let frame = step(metrics, session, movement, options).await?;
-                    let frame = Arc::new(convert::observation(seq, session, frame)?);
+                    let driven = step(metrics, session, movement, options).await?;
+                    let frame = Arc::new(convert::observation(seq, session, driven)?);
                     slot.update_view();
                     slot.show(&frame);
                     Ok(frame)
-                };
-                let result = result.await;
+                }
+                .await;
                 Stepped { session: name, result }
             }
         });

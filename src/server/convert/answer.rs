@@ -327,7 +327,6 @@ pub(super) fn camera(camera: &wildcity_scene::rig::RigCamera) -> RigCamera {
     wildcity_scene::rig::RigCamera { appearance, ..camera.clone() }.into()
 }
 
-/// A pose.
 pub(super) fn pose(pose: &Pose) -> message::Pose {
     (*pose).into()
 }
@@ -341,7 +340,6 @@ pub(super) fn encoding(encoding: ImageEncoding) -> (message::Encoding, Option<u8
     }
 }
 
-/// JSON text.
 pub(super) fn text(value: &impl Serialize) -> Result<String, Fault> {
     serde_json::to_string(value).map_err(|error| Fault::Internal(error.to_string()))
 }

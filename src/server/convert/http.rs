@@ -45,7 +45,6 @@ pub(crate) fn new_upload(body: &[u8]) -> Result<Announced, Fault> {
     Ok(Announced { name, size, digest })
 }
 
-/// An upload.
 pub(crate) fn upload(upload: &Upload) -> Value {
     let Announced { name, size, .. } = upload.announced();
     json!(http::Upload {
@@ -120,8 +119,8 @@ pub(super) fn requested_files(files: Vec<http::PushFile>) -> Result<Vec<Requeste
 }
 
 fn requested_file(index: usize, file: http::PushFile) -> Result<RequestedFile, PushError> {
-    let axes = SourceAxes::given(file.axes.as_deref(), file.scale);
-    let axes = axes.map_err(|error| {
+    let given = SourceAxes::given(file.axes.as_deref(), file.scale);
+    let axes = given.map_err(|error| {
         // Both are read together, so that the error has to say which one it is about.
         let part = match error {
             IngestError::InvalidAxes { option: "--scale", .. } => "scale",
@@ -300,7 +299,6 @@ pub(crate) fn version(version: &Version) -> Value {
     json!(http::MadeVersion { version: version.number, version_hash: version.hash.clone() })
 }
 
-/// All sessions.
 pub(crate) fn sessions(sessions: &[ListedSession]) -> Value {
     let session = |ListedSession { name, view, connected }: &ListedSession| http::SessionInfo {
         session: name.clone(),
@@ -313,7 +311,6 @@ pub(crate) fn sessions(sessions: &[ListedSession]) -> Value {
     json!({ "sessions": sessions.iter().map(session).collect::<Vec<_>>() })
 }
 
-/// A new ticket.
 pub(crate) fn ticket(ticket: String) -> Value {
     json!(http::Ticket { ticket, expires_ms: limits::TICKET_AGE.as_millis() as u64 })
 }
@@ -326,7 +323,6 @@ pub(crate) struct ListedEpisode {
     pub(crate) mcap_error: Option<String>,
 }
 
-/// Recorded episodes.
 pub(crate) fn episodes(episodes: &[ListedEpisode]) -> Value {
     let episode = |ListedEpisode { listed, overview, mcap_error }: &ListedEpisode| {
         // Not all file systems have the time of the last change.

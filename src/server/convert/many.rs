@@ -66,8 +66,9 @@ fn refusal(index: usize, fault: &Fault) -> SessionRefusal {
     let Refusal { code, message, field, .. } = fault.report().body;
     // A step in a list has no type. A step that does not fit the state of a session is a fault of
     // the field `session`.
-    let field = field.map(|field| if field == "type" { "session".to_owned() } else { field });
-    let field = field.map(|field| format!("steps[{index}].{field}"));
+    let field = field
+        .map(|field| if field == "type" { "session".to_owned() } else { field })
+        .map(|field| format!("steps[{index}].{field}"));
     SessionRefusal { code, message, field }
 }
 

@@ -37,7 +37,6 @@ pub(crate) use many::{Stepped, many};
 pub(crate) use observation::observation;
 pub(crate) use request::{BranchPoint, Command, Parsed, SessionStep, parse};
 
-/// The WebSocket subprotocol.
 pub(crate) const SUBPROTOCOL: &str = wildcity_protocol::PROTOCOL;
 
 /// The WebSocket subprotocol of a watcher.

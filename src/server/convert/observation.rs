@@ -202,8 +202,10 @@ fn metadata(
     let stage = |&(name, ms): &(&str, f64)| Stage { name: name.to_owned(), ms };
     let anchor = version.manifest.geo.as_ref();
     // Only twins with a place on the earth have one.
-    let located = anchor.map(|anchor| anchor.locate(&episode.world_from_rig())).transpose();
-    let located = located.map_err(|error| Fault::Internal(error.to_string()))?;
+    let located = anchor
+        .map(|anchor| anchor.locate(&episode.world_from_rig()))
+        .transpose()
+        .map_err(|error| Fault::Internal(error.to_string()))?;
     Ok(ObservationMetadata {
         seq,
         step: episode.step(),

@@ -64,12 +64,12 @@ pub(crate) enum Command {
     },
     /// Renders images of poses.
     Observe {
-        /// `world_from_rig` of each.
+        /// The pose `world_from_rig` of each view.
         poses: Vec<Pose>,
     },
     /// Loads the sections that are visible from poses.
     Prefetch {
-        /// `world_from_rig` of each.
+        /// The pose `world_from_rig` of each view.
         poses: Vec<Pose>,
     },
     /// Begins a new episode.

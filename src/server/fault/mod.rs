@@ -666,8 +666,13 @@ mod tests {
     fn the_page_of_the_protocol_has_the_same_table() {
         let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../protocol/README.md");
         let page = std::fs::read_to_string(path).unwrap();
-        let section = page.split("\n## Errors").nth(1).expect("a section on errors");
-        let section = section.split("\n## ").next().expect("split gives at least one part");
+        let section = page
+            .split("\n## Errors")
+            .nth(1)
+            .expect("a section on errors")
+            .split("\n## ")
+            .next()
+            .expect("split gives at least one part");
         // The codes of the page are compared with those of the type, both sorted: neither may have
         // one more.
         let mut rows: Vec<(String, u16)> = Vec::new();

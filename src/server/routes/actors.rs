@@ -67,8 +67,8 @@ pub(super) async fn push(
     let _cancelling = CancelWhenDropped(push.clone());
     let polls = state.engine.polls().clone();
     let run = run(state, push, OwnedPush { grant, _open: open }, request, files);
-    let made = polls.spawn("push of an asset", run);
-    let made = deadline.extend_during(made).await.map_err(|_| PushError::Crashed)?;
+    let making = polls.spawn("push of an asset", run);
+    let made = deadline.extend_during(making).await.map_err(|_| PushError::Crashed)?;
     let AddedActor { actor, is_new } = made??;
     let status = if is_new { StatusCode::CREATED } else { StatusCode::OK };
     // The token is not limited to some twins.

@@ -71,7 +71,8 @@ pub(super) async fn mcap(
     Path(name): Path<String>,
 ) -> HttpResult {
     // The token is checked before the wait, which takes up to 20 s.
-    let (checked, its_name) = (state.clone(), name.clone());
+    let checked = state.clone();
+    let its_name = name.clone();
     let record = blocking(move || find_record(&checked, &grant, &its_name)).await?;
     let is_over = state.engine.wait_for_exports(Some(&name), limits::MCAP_WAIT).await;
     let bytes = blocking(move || {

@@ -45,8 +45,7 @@ pub(super) async fn show_all(State(state): State<Arc<ServerState>>) -> HttpResul
         spool_bytes: spooled.bytes,
         pushes_open: state.pushes.open_count(),
     };
-    let text = state.metrics.text(gauges);
-    let text = text.map_err(|error| Fault::Internal(error.to_string()))?;
+    let text = state.metrics.text(gauges).map_err(|error| Fault::Internal(error.to_string()))?;
     let content_type = "application/openmetrics-text; version=1.0.0; charset=utf-8";
     Ok(([(header::CONTENT_TYPE, content_type)], text).into_response())
 }
@@ -60,8 +59,10 @@ pub(super) async fn count_refusals(
     let limit = wildcity_protocol::limits::INBOUND_MESSAGE_BYTES;
     let too_large =
         |bytes: usize| Refusal::from(Fault::MessageTooLarge { bytes, limit }).into_response();
-    let announced = request.headers().get(header::CONTENT_LENGTH);
-    let announced = announced.and_then(|length| length.to_str().ok()?.parse::<usize>().ok());
+    let announced = request
+        .headers()
+        .get(header::CONTENT_LENGTH)
+        .and_then(|length| length.to_str().ok()?.parse::<usize>().ok());
     // Only the parts of an upload may be larger.
     let is_upload = request.method() == Method::PATCH;
     let mut response = match announced {

@@ -7,7 +7,7 @@ use axum::response::IntoResponse;
 
 const DOCUMENT: &str = include_str!("../../../protocol/openapi.json");
 
-/// `GET /v1/openapi.json`.
+/// The handler of `GET /v1/openapi.json`.
 pub(super) async fn show() -> impl IntoResponse {
     ([(header::CONTENT_TYPE, "application/json")], DOCUMENT)
 }
@@ -194,7 +194,7 @@ mod tests {
         }
     }
 
-    /// `get_v1_twins_twin`.
+    /// Id of an operation, such as `get_v1_twins_twin`.
     fn id(operation: &Operation) -> String {
         let words = operation.path.split(|c: char| !c.is_ascii_alphanumeric());
         let words: Vec<&str> = std::iter::once(verb(operation.method))

@@ -89,7 +89,7 @@ pub(super) enum Kind {
 )]
 pub(super) struct Parameter {
     pub(super) name: &'static str,
-    /// `query` or `header`.
+    /// Where the parameter is: `query` or `header`.
     pub(super) place: &'static str,
     pub(super) kind: Kind,
     pub(super) is_required: bool,

@@ -113,19 +113,22 @@ pub(super) async fn edit(
     // If the client disconnects, the edit is still completed, so that there is never a part of a
     // version.
     let polls = state.engine.polls().clone();
-    let edited = polls.spawn("edit", async move {
-        let _open = open;
-        let target = Target::Twin(request.twin.clone());
-        let change = Change { what: "edit", target, id: None };
-        state.audit.begin(&grant, &change).await?;
-        let viewpoints = |twin: &str| state.sessions.viewpoints_on(twin);
-        let edited =
-            wildcity_push::publish_edit(&state.engine, &state.pushes, request, &viewpoints).await;
-        let made = edited.as_ref().map(|version| Made::Version(version.number));
-        state.audit.end(&grant, &change, made).await;
-        Ok::<_, Fault>(edited?)
-    });
-    let edited = edited.await.map_err(|_| PushError::Crashed)?;
+    let edited = polls
+        .spawn("edit", async move {
+            let _open = open;
+            let target = Target::Twin(request.twin.clone());
+            let change = Change { what: "edit", target, id: None };
+            state.audit.begin(&grant, &change).await?;
+            let viewpoints = |twin: &str| state.sessions.viewpoints_on(twin);
+            let edited =
+                wildcity_push::publish_edit(&state.engine, &state.pushes, request, &viewpoints)
+                    .await;
+            let made = edited.as_ref().map(|version| Made::Version(version.number));
+            state.audit.end(&grant, &change, made).await;
+            Ok::<_, Fault>(edited?)
+        })
+        .await
+        .map_err(|_| PushError::Crashed)?;
     Ok(Json(convert::edited(&edited?)).into_response())
 }
 

@@ -53,7 +53,7 @@ pub(super) async fn show(
     Ok(answer(StatusCode::OK, &*state.spool()?.get(&grant.name, &id)?))
 }
 
-/// `DELETE /v1/uploads/{id}`.
+/// The handler of `DELETE /v1/uploads/{id}`.
 pub(super) async fn delete(
     State(state): State<Arc<ServerState>>,
     Extension(grant): Extension<Arc<Grant>>,
@@ -264,8 +264,9 @@ fn sha256_of_content(headers: &HeaderMap) -> Result<Option<Vec<u8>>, Fault> {
         return Ok(None);
     };
     let base64 = digest.strip_prefix(':').and_then(|rest| rest.strip_suffix(':'));
-    let bytes = base64.and_then(|base64| BASE64.decode(base64.as_bytes()).ok());
-    let bytes = bytes.filter(|bytes| bytes.len() == 32);
+    let bytes = base64
+        .and_then(|base64| BASE64.decode(base64.as_bytes()).ok())
+        .filter(|bytes| bytes.len() == 32);
     bytes.map(Some).ok_or_else(|| Fault::InvalidRequest {
         field: Some(CONTENT_DIGEST.to_string()),
         reason: format!("{digest:?} is not base64 of 32 bytes between colons"),

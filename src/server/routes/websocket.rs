@@ -93,8 +93,11 @@ impl Slots {
         // The token's own limit first, so that its error is the one that is named.
         let of_token = state.open_connections.connection(grant)?;
         let limit = state.limits.connections;
-        let of_server = state.websocket_permits.clone().try_acquire_owned();
-        let of_server = of_server.map_err(|_| Fault::Busy { what: "connections", limit })?;
+        let of_server = state
+            .websocket_permits
+            .clone()
+            .try_acquire_owned()
+            .map_err(|_| Fault::Busy { what: "connections", limit })?;
         Ok(Self { _connection: connection, _of_server: of_server, _of_token: of_token })
     }
 }

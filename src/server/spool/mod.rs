@@ -91,8 +91,7 @@ impl Spool {
         own_bytes: BTreeMap<String, u64>,
     ) -> io::Result<Self> {
         create_dirs(&*medium.disk, &medium.dir).map_err(io::Error::other)?;
-        let lock = medium.disk.lock(&medium.dir.join("lock"), Wait::No)?;
-        let lock = lock.ok_or_else(|| {
+        let lock = medium.disk.lock(&medium.dir.join("lock"), Wait::No)?.ok_or_else(|| {
             io::Error::other("another server uses it: give one of them another --uploads DIR")
         })?;
         let spool = Self {

@@ -173,8 +173,9 @@ impl Upload {
         self.release.notify_waiters();
         // The other connection ends when it sees the signal, or at the latest when it was silent
         // for as long.
-        let lock = timeout(limits::UPLOAD_SILENCE, self.writing.clone().lock_owned()).await;
-        let lock = lock.map_err(|_| Fault::Busy { what: "connections that write it", limit: 1 })?;
+        let lock = timeout(limits::UPLOAD_SILENCE, self.writing.clone().lock_owned())
+            .await
+            .map_err(|_| Fault::Busy { what: "connections that write it", limit: 1 })?;
         Ok(Writer { upload: self.clone(), _lock: lock, file: None })
     }
 
@@ -182,9 +183,9 @@ impl Upload {
     pub(super) fn create(&self) -> Result<(), Fault> {
         let create = || {
             let announced = self.announced.clone();
-            let announced = AnnouncedBy { announced, owner: self.owner.clone() };
+            let by = AnnouncedBy { announced, owner: self.owner.clone() };
             let mut file = self.medium.disk.create(&self.file("json"))?;
-            file.write_all(&serde_json::to_vec(&announced)?)?;
+            file.write_all(&serde_json::to_vec(&by)?)?;
             self.medium.disk.create(&self.file("part"))
         };
         create().map_err(write_fault)?;

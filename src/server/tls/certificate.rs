@@ -63,7 +63,11 @@ fn time(tag: u8, text: &str) -> Option<SystemTime> {
         _ => return None,
     };
     let part = |at: usize| rest.get(at..at + 2)?.parse::<u64>().ok();
-    let [month, day, hour, minute, second] = [part(0)?, part(2)?, part(4)?, part(6)?, part(8)?];
+    let month = part(0)?;
+    let day = part(2)?;
+    let hour = part(4)?;
+    let minute = part(6)?;
+    let second = part(8)?;
     if year < 1970 || !(1..=12).contains(&month) || !(1..=31).contains(&day) {
         return None;
     }

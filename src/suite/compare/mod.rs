@@ -42,7 +42,7 @@ use pair::Key;
 /// Comparison of a run with a previous run. The same two results give the same bytes.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Comparison {
-    /// `wildcity.suite-comparison/1`.
+    /// Name of the format: `wildcity.suite-comparison/1`.
     pub format: &'static str,
     /// Whether the later run is worse, by the rule.
     pub worse: bool,
@@ -113,12 +113,7 @@ pub enum CompareError {
         "the runs cannot be compared: steps took {before_us} µs before and take {after_us} µs now; run both suites with \
          one dt_us"
     )]
-    StepLength {
-        /// Before, in microseconds.
-        before_us: i64,
-        /// Now, in microseconds.
-        after_us: i64,
-    },
+    StepLength { before_us: i64, after_us: i64 },
     /// The verdicts are by different rules.
     #[error(
         "the runs cannot be compared: verdicts were by {before} before and are by {after} now; run the driver of before \

@@ -27,7 +27,7 @@ pub struct Rule {
     pub worse_by: BTreeMap<String, f64>,
 }
 
-/// One tolerance, `NAME=AMOUNT`.
+/// A tolerance of one score, written `NAME=AMOUNT`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Tolerance {
     /// [`PASS_RATE`], or the name of a score, with or without its version.
@@ -65,8 +65,11 @@ impl Rule {
     pub(super) fn resolved(&self, known: &[&str]) -> Result<Self, CompareError> {
         let full = |name: &str| {
             // The full name first or the name without a version: a rule outlives versions.
-            let found = known.iter().find(|full| **full == name || base(full) == name);
-            let found = found.copied().or((name == PASS_RATE).then_some(PASS_RATE));
+            let found = known
+                .iter()
+                .find(|full| **full == name || base(full) == name)
+                .copied()
+                .or((name == PASS_RATE).then_some(PASS_RATE));
             found.map(str::to_owned).ok_or_else(|| CompareError::UnknownScore {
                 name: name.to_owned(),
                 known: [PASS_RATE].iter().chain(known).map(|&name| name.to_owned()).collect(),

@@ -116,8 +116,11 @@ impl Comparison<'_> {
             format!("twin {:?} has no trajectory: give --cameras", manifest.twin)
         })?;
         let world_from_rig = drive.at_station(0.5 * drive.length_m());
-        let rig = manifest.rig.clone().or_else(|| Rig::preset(wildcity_session::limits::RIG));
-        let rig = rig.context("the default rig preset is missing")?;
+        let rig = manifest
+            .rig
+            .clone()
+            .or_else(|| Rig::preset(wildcity_session::limits::RIG))
+            .context("the default rig preset is missing")?;
         let names = rig.cameras.iter().map(|camera| camera.name.clone());
         let views = View::from_rig(&rig.cameras, world_from_rig);
         Ok(names.zip(views).map(|(name, view)| NamedView { name, view }).collect())

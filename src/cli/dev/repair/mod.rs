@@ -208,6 +208,7 @@ fn read_image(path: &Path) -> anyhow::Result<Image> {
     ensure!(reader.format().is_some(), "--image {}: neither PNG nor JPEG", path.display());
     let largest = wildcity_repair::limits::MAX_SIDE_PX as u32;
     let mut limits = image::Limits::default();
+    // Before decoding, so that a small file cannot ask for gigabytes.
     limits.max_image_width = Some(largest);
     limits.max_image_height = Some(largest);
     reader.limits(limits);
@@ -229,6 +230,7 @@ fn pattern(width: usize, height: usize) -> Image {
     let mut rgb8 = Vec::with_capacity(3 * width * height);
     for y in 0..height {
         for x in 0..width {
+            // At most 159 + 48: the sum of both fits a byte.
             let edge = if (x / 24 + y / 24) % 2 == 0 { 48 } else { 0 };
             let across = (x * 160 / width) as u8;
             let down = (y * 160 / height) as u8;

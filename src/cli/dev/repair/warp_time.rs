@@ -62,6 +62,7 @@ fn depth(camera: &Camera, wall_m: f64) -> Vec<f32> {
     let width = camera.width_px as usize;
     let depth_m = |at: usize| {
         let at_px = DVec2::new((at % width) as f64 + 0.5, (at / width) as f64 + 0.5);
+        // Nearly parallel to the wall, a ray meets it too far away to matter.
         let ray = camera.unproject(at_px).filter(|ray| ray.z > 0.05);
         ray.map_or(0.0, |ray| camera.depth_m(ray * (wall_m / ray.z)) as f32)
     };

@@ -59,6 +59,8 @@ impl MovingActor {
         if !(0.0..=route.length_m()).contains(&at_m) {
             return None;
         }
+        // A negative speed is that of oncoming traffic, which faces the other way and does not
+        // reverse.
         let heading_rad = if speed_m_per_s < 0.0 { PI } else { 0.0 };
         let drive_from_actor =
             Pose { position_m: left_m * DVec3::Y, rotation: DQuat::from_rotation_z(heading_rad) };
@@ -75,7 +77,9 @@ impl MovingActor {
     pub(super) fn row(&self, route: &Route<'_>, time_us: i64, time_s: f64) -> Option<TrackRow> {
         let pose = self.pose_at(route, time_s)?;
         let ActorBox { length_m, width_m, height_m } = self.box_;
+        // The origin of an actor is on the ground, that of a track in the middle of its box.
         let middle = Pose { position_m: 0.5 * height_m * DVec3::Z, ..Pose::IDENTITY };
+        // Along the heading, which has been turned already: so without the sign.
         let velocity = self.motion.speed_m_per_s.abs() * (pose.rotation * DVec3::X);
         Some(TrackRow {
             time_us,

@@ -99,6 +99,7 @@ impl Generate {
             None => BERLIN.parse()?,
         };
         let header = self.header(&drive.name, geo.clone());
+        // Read before the log is begun, so that a bad map leaves nothing behind.
         let map = self.map()?;
         let mut log = LogWriter::create(&self.out, &header, &rig)?;
         map.map_or(Ok(()), |map| log.put_map(&map))?;
@@ -159,6 +160,7 @@ impl Generate {
             licence: "that of the twin".to_owned(),
             converter: format!("wildcity log generate {}", env!("CARGO_PKG_VERSION")),
         };
+        // On the roof, a metre ahead of the rig's origin and two metres above the ground.
         let position_m = glam::DVec3::new(1.0, 0.0, 2.0);
         let rig_from_lidar = Pose { position_m, ..Pose::IDENTITY };
         let mut header = Header::new(drive, source);

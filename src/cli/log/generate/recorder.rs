@@ -71,6 +71,7 @@ impl Recorder<'_> {
             to_us - from_us
         );
         self.record_poses(from_us, to_us, log)?;
+        // Whole turns only: the last sweep must end before the last pose.
         let turns = (to_us - from_us) / PERIOD_US;
         bar.set_length(turns as u64);
         let mut images = 0;
@@ -90,6 +91,7 @@ impl Recorder<'_> {
             log.add(&Keyframe { time_us, world_from_rig })?;
             let imu = sensors::imu(&self.route, time_us);
             imu.map_or(Ok(()), |row| log.add(&row))?;
+            // Fixes and boxes at the rate of the LiDAR, every tenth pose.
             if step % (PERIOD_US / POSE_US) == 0 {
                 log.add(&sensors::gps(&self.geo, &world_from_rig, time_us)?)?;
                 for actor in &self.actors {
@@ -105,6 +107,7 @@ impl Recorder<'_> {
     fn record_images(&self, turn: usize, us: i64, log: &mut LogWriter) -> anyhow::Result<usize> {
         let mut kept = 0;
         for (index, mounted) in self.rig.cameras.iter().enumerate() {
+            // Counted from 1: counted from 0, the first image would always be dropped.
             let number = turn * self.rig.cameras.len() + index + 1;
             if self.drop_every > 0 && number.is_multiple_of(self.drop_every) {
                 continue;
@@ -129,6 +132,7 @@ impl Recorder<'_> {
         let jpeg = wildcity_session::jpeg(&rendered.rgb8, width, height, JPEG_QUALITY);
         let file = format!("images/{name}/{time_us:010}.jpg");
         log.put(&file, &jpeg.map_err(|reason| anyhow!("{file}: {reason}"))?)?;
+        // Where no Gaussian is, the twin shows its sky.
         let is_sky: Vec<bool> = rendered.opacity.iter().map(|opacity| *opacity < 0.5).collect();
         let sky_file = format!("sky/{name}/{time_us:010}.png");
         log.put(&sky_file, &mask_png(&is_sky, [width, height])?)?;
@@ -150,6 +154,7 @@ impl Recorder<'_> {
         let late_us = self.lidar_late_us;
         let end_us = begin_us + PERIOD_US;
         let at = |time_us| anyhow::Ok(self.route.pose_at(time_us)? * self.rig_from_lidar);
+        // Rendered at the true times: only what the log says of them is late.
         let view = LidarView {
             lidar: self.lidar.clone(),
             world_from_lidar: at(end_us)?,
@@ -180,6 +185,8 @@ impl Recorder<'_> {
         let placed = (0..).zip(&self.actors).filter_map(|(index, actor)| {
             let end = at(actor, time_us, index)?;
             let start = at(actor, start_us, index)
+                // An actor that is not on the drive yet when the turn begins stands still during
+                // it.
                 .map_or(end.world_from_actor, |start| start.world_from_actor);
             Some(PlacedChunk { world_from_actor_at_start: start, ..end })
         });

@@ -38,6 +38,8 @@ pub(super) fn lidar(duration_us: i64) -> Result<Lidar, LidarError> {
         columns: Some(LidarColumns {
             count: BEAMS[1].into(),
             first_rad: half,
+            // The LiDAR turns clockwise, from pi to one column before -pi: the next turn begins
+            // there.
             last_rad: TAU / columns - half,
         }),
         duration_us,
@@ -50,6 +52,7 @@ pub(super) fn lidar(duration_us: i64) -> Result<Lidar, LidarError> {
 pub(super) fn points(lidar: &Lidar, sweep: &Sweep, begin_us: i64) -> SweepPoints {
     let mut points = SweepPoints::default();
     for column in 0..lidar.columns() {
+        // Ages count back from the end of the sweep, times of a log forward from its beginning.
         let until_end_us = lidar.duration_us() as f64 - lidar.age_us(column);
         for row in 0..lidar.rows() {
             let at = row * lidar.columns() + column;
@@ -72,12 +75,15 @@ pub(super) fn imu(route: &Route<'_>, time_us: i64) -> Option<ImuRow> {
     let poses = [at(-DIFFERENCE_US)?, at(0)?, at(DIFFERENCE_US)?];
     let step_s = DIFFERENCE_US as f64 / 1e6;
     let [before, here, after] = poses;
+    // Central differences: both are of the same instant, that of `here`.
     let turned = before.rotation.inverse() * after.rotation;
     let second = before.position_m + after.position_m - 2.0 * here.position_m;
+    // An accelerometer measures specific force: at rest it shows gravity, upwards.
     let world = second / (step_s * step_s) + GRAVITY_M_PER_S2 * DVec3::Z;
     Some(ImuRow {
         time_us,
         angular_velocity_rad_per_s: (turned.to_scaled_axis() / (2.0 * step_s)).to_array(),
+        // From the world into the axes of the rig.
         acceleration_m_per_s2: (here.rotation.inverse() * world).to_array(),
     })
 }

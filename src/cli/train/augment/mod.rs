@@ -152,6 +152,7 @@ impl Augment {
                 bar.set_length(all);
                 bar.set_position(done);
             };
+            // The server is stopped whether or not drawing failed.
             let drawn = augmentation.run(&running.url(), &mut show).await;
             running.stop().await;
             drawn
@@ -192,6 +193,7 @@ impl Augment {
             repairs: models,
             ..Config::local(directories, Arc::from(self.backend.backend()?))
         };
+        // A step of this server draws and repairs all images of a place, on a machine of any speed.
         config.limits.step = PLACE_TIMEOUT;
         Ok(config)
     }

@@ -120,7 +120,6 @@ impl FromStr for Up {
     }
 }
 
-/// A point.
 #[derive(Clone, Copy, Debug)]
 struct Point(DVec3);
 
@@ -146,6 +145,7 @@ impl Align {
         let cameras = self.read_cameras(&catalog, &base)?;
         let sh_degree = base.manifest.sh_degree;
         let mut gaussians = Gaussians { sh_degree, ..Gaussians::default() };
+        // In full detail only: coarser levels show the same surfaces again.
         catalog.visit_full_detail(&base, &|_| true, &mut |section| gaussians.append(&section))?;
 
         let search = GroundSearch { up: self.up.0, seed: self.seed, ..GroundSearch::default() };
@@ -156,6 +156,8 @@ impl Align {
         let ground = found.with_context(|| format!("twin {}", self.edited.twin.name))?;
         let height = cameras.map(|cameras| cameras.height_above(&ground));
         let scale = match (self.camera_height_m, height) {
+            // The cameras are one height above the ground in units of the twin: the wanted one
+            // gives the scale.
             (Some(height_m), Some(height)) => height_m / height,
             _ => metres_per_unit,
         };
@@ -166,9 +168,11 @@ impl Align {
             writeln!(output::stdout(), "cameras     {height_m:.2} m above the ground (median)")?;
         }
 
-        let picture = self.picture.clone();
-        let picture =
-            picture.unwrap_or_else(|| format!("{}-align.png", self.edited.twin.name).into());
+        let picture = self
+            .picture
+            .clone()
+            .unwrap_or_else(|| format!("{}-align.png", self.edited.twin.name).into());
+        // Before the version is written: the picture shows whether the proposal is right.
         let (png, step_m) =
             picture::before_and_after(gaussians, &alignment, base.manifest.profile)?;
         output::write(&picture, &png)?;
@@ -183,6 +187,7 @@ impl Align {
         let edit = Edit { alignment, trajectories: Vec::new(), rig: None };
         let version = catalog.edit(&base, edit, &mut progress::show(&bar))?;
         bar.finish_and_clear();
+        // An anchor is the place of the old origin, with the old axes.
         if base.manifest.geo.is_some() {
             let name = &self.edited.twin.name;
             writeln!(
@@ -223,6 +228,7 @@ impl Align {
             }
             _ => {
                 let scale = self.scale.unwrap_or(1.0);
+                // Checked here, so that a bad scale is refused before the twin is read.
                 Alignment::IDENTITY.scaled(scale).context("--scale")?;
                 Ok(scale)
             }
@@ -245,6 +251,7 @@ fn read_poses(source: &Path) -> anyhow::Result<Vec<Pose>> {
 
 fn height_m(text: &str) -> Result<f64, String> {
     match text.parse() {
+        // NaN is in no range, and is refused, too.
         Ok(height_m) if (1e-3..=1e4).contains(&height_m) => Ok(height_m),
         _ => Err("expected a height above the ground in metres, such as 1.6".to_owned()),
     }
@@ -252,6 +259,7 @@ fn height_m(text: &str) -> Result<f64, String> {
 
 /// Without the rounding errors of a power of ten: 0.1 for 0.10000000000000003.
 fn rounded(step_m: f64) -> f64 {
+    // A power of ten that keeps the first digit of a step below 1: 0.2000000001 becomes 0.2.
     let digits = 10_f64.powf((-step_m.log10()).ceil().max(0.0));
     (step_m * digits).round() / digits
 }

@@ -16,7 +16,6 @@ use crate::cli::caption;
 
 /// Size of one of the four pictures, in pixels.
 const SIZE_PX: [u32; 2] = [720, 440];
-/// Pixels between them.
 const GAP_PX: u32 = 6;
 /// Share of Gaussians on each side of each axis that are left out: the sky and floaters.
 const LEFT_OUT: f64 = 0.02;
@@ -50,6 +49,7 @@ pub(super) fn before_and_after(
     alignment: &Alignment,
     profile: RenderProfile,
 ) -> anyhow::Result<(Vec<u8>, f64)> {
+    // Every n-th and not the first ones: cells are stored one after the other.
     let stride = gaussians.len().div_ceil(MOST).max(1);
     let before = match stride {
         1 => gaussians,
@@ -62,10 +62,12 @@ pub(super) fn before_and_after(
     let grid = grid(&aligned, step_m);
     let old = |at_m: DVec3| {
         let new_from_old = alignment.new_from_old;
+        // An alignment moves first and scales then: it is undone in the other order.
         new_from_old.inverse().transform_point(at_m / alignment.metres_per_unit)
     };
     let old_grid: Vec<[DVec3; 2]> = grid.iter().map(|line| line.map(old)).collect();
 
+    // From far away: with a reach, nothing would be drawn.
     let profile = RenderProfile { background: [0.05, 0.06, 0.07], reach_m: None, ..profile };
     let [width, height] = SIZE_PX;
     let mut all = RgbImage::new(2 * width + GAP_PX, 2 * height + GAP_PX);
@@ -91,11 +93,13 @@ impl Extent {
             let mut values: Vec<f64> = gaussians.means_m.iter().map(|mean| mean[axis]).collect();
             let last = values.len().saturating_sub(1);
             let skipped = (last as f64 * LEFT_OUT) as usize;
+            // Only two of the values are needed: selecting is linear, and sorting is not.
             let mut end = |at: usize| *values.select_nth_unstable_by(at, f64::total_cmp).1;
             [end(skipped), end(last - skipped)]
         });
         let low = DVec3::from_array(ends.map(|[low, _]| low));
         let high = DVec3::from_array(ends.map(|[_, high]| high));
+        // A flat twin has a height of 0, by which `view` would divide.
         let least = 1e-3 * (high - low).max_element().max(1e-6);
         Self { middle: 0.5 * (low + high), half: (0.55 * (high - low)).max(DVec3::splat(least)) }
     }
@@ -138,6 +142,7 @@ fn draw(
 ) -> anyhow::Result<RgbImage> {
     let mut shown = *extent;
     if is_side {
+        // From the side, what stands in front would hide the middle: only a slice is drawn.
         shown.half.y *= SLICE;
     }
     let is_shown = |&i: &usize| shown.has(DVec3::from_array(gaussians.means_m[i]));
@@ -161,14 +166,19 @@ fn view(extent: &Extent, is_side: bool) -> View {
         if is_side { [DVec3::Y, DVec3::NEG_Z] } else { [DVec3::NEG_Z, DVec3::NEG_Y] };
     let across = half.x;
     let upwards = if is_side { half.z } else { half.y };
+    // Far compared with the size, so that perspective hardly bends parallel lines.
     let away = AWAY * half.max_element();
+    // A half of the scene then takes 0.47 of the picture, which leaves a margin of 3 % at each
+    // side.
     let focal_px = 0.47 * away * (width / across).min(height / upwards);
     view_along(SIZE_PX, focal_px, middle - away * forward, forward, down)
 }
 
 /// Draws a line of the ground over the picture, half transparent.
 fn line(picture: &mut RgbImage, view: &View, from: DVec3, to: DVec3) {
-    let (Some(from), Some(to)) = (view.project_world(from), view.project_world(to)) else { return };
+    let ends_px = view.project_world(from).zip(view.project_world(to));
+    let Some((from, to)) = ends_px else { return };
+    // One step a pixel; the bound is for lines of which an end projects far outside.
     let steps = (to - from).abs().max_element().ceil().clamp(1.0, 4_000.0);
     for step in 0..=steps as u32 {
         let at: DVec2 = from.lerp(to, f64::from(step) / steps);
@@ -178,6 +188,7 @@ fn line(picture: &mut RgbImage, view: &View, from: DVec3, to: DVec3) {
         if is_inside {
             let pixel = picture.get_pixel_mut(at.x as u32, at.y as u32);
             for (channel, grid) in pixel.0.iter_mut().zip(GRID.0) {
+                // Half transparent; in u16, because the sum of two u8 can overflow.
                 *channel = ((u16::from(*channel) + u16::from(grid)) / 2) as u8;
             }
         }

@@ -24,8 +24,9 @@ impl Check {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let context = || format!("{}", self.file.display());
         let bytes = ingest::read_whole(&self.file, wildcity_sim::limits::MAP_BYTES as u64);
-        let map = MapFile::parse(&bytes.with_context(context)?).and_then(Map::new);
-        let map = map.with_context(context)?;
+        let map = MapFile::parse(&bytes.with_context(context)?)
+            .and_then(Map::new)
+            .with_context(context)?;
         let file = map.file();
         writeln!(
             output::stdout(),

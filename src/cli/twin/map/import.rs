@@ -41,13 +41,17 @@ pub(in crate::cli) struct Import {
 impl Import {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let context = || format!("{}", self.file.display());
-        let bytes = ingest::read_whole(&self.file, wildcity_convert::TEXT_BYTES as u64);
-        let bytes = bytes.with_context(context)?;
+        let bytes = ingest::read_whole(&self.file, wildcity_convert::TEXT_BYTES as u64)
+            .with_context(context)?;
         anyhow::ensure!(
+            // Both are XML of ASAM, and easily mixed up: the message names the command for the
+            // other one.
             !is_openscenario(&bytes),
             "{} is OpenSCENARIO: `wildcity scenario import` reads it",
             self.file.display()
         );
+        // By content and not by name: GeoJSON has the extensions .geojson and .json, and XML begins
+        // with `<`.
         let is_json = bytes.trim_ascii_start().first() == Some(&b'{');
         let (map, geo, warnings) = if is_json {
             (geojson::read(&bytes, self.origin).with_context(context)?, None, Vec::new())
@@ -96,7 +100,7 @@ fn anchor_text(geo: &GeoAnchor) -> String {
     }
 }
 
-/// EAST,NORTH.
+/// Parses the option `--origin`, as `EAST,NORTH`.
 pub(in crate::cli) fn origin(text: &str) -> Result<[f64; 2], String> {
     let expected = || {
         "expected two numbers, for example 691000,5334000 in metres or 11.58,48.14 in degrees"

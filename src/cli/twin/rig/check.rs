@@ -39,6 +39,7 @@ impl Check {
             let ReprojectionErrors { count, worst_px } =
                 ReprojectionErrors::measure(&*backend, &camera_view(camera))?;
             writeln!(out, "{:<24} {count:>3} points, at most {worst_px:.3} px off", camera.name)?;
+            // A camera of which no point was found shows nothing where it should.
             if worst_px > MAX_DISTANCE_PX || count == 0 {
                 wrong.push(camera.name.clone());
             }

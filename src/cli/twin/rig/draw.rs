@@ -84,6 +84,8 @@ fn draw_camera(chart: &mut Chart<'_, '_>, camera: &RigCamera, index: usize) -> D
     // The end of a ray of the middle row, at (y, x) of the rig.
     let ray_end = |k: u32| {
         let at_px = DVec2::new(width * f64::from(k) / f64::from(RAYS - 1), height / 2.0);
+        // Seen from above: a ray that points straight down has no direction, and ends at the
+        // camera.
         let direction = view.ray_world(at_px)?.truncate();
         let end_m = position_m.truncate() + VIEW_M * direction.normalize_or_zero();
         Some((end_m.y, end_m.x))
@@ -92,6 +94,7 @@ fn draw_camera(chart: &mut Chart<'_, '_>, camera: &RigCamera, index: usize) -> D
     let outline: Vec<(f64, f64)> =
         [camera_at].into_iter().chain((0..RAYS).filter_map(ray_end)).collect();
     let closed: Vec<(f64, f64)> = outline.iter().copied().chain([camera_at]).collect();
+    // The outline has at least the camera itself, if no ray of the middle row exists.
     let label_at = outline[outline.len() / 2];
     let color = Palette99::pick(index);
     chart.draw_series([

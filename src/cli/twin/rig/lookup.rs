@@ -9,6 +9,7 @@ use wildcity_scene::rig::RigCamera;
 
 /// The preset of this name, or else the rig in this file.
 pub(in crate::cli) fn find_rig(name: &str) -> anyhow::Result<Rig> {
+    // Presets come first, so that a file in the current folder cannot change what a name means.
     if let Some(rig) = Rig::preset(name) {
         return Ok(rig);
     }

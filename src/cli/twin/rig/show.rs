@@ -55,7 +55,10 @@ impl Show {
             let height_px = camera.camera.height_px;
             let [x, y, z] = camera.rig_from_camera.position_m.to_array();
             let forward = camera.rig_from_camera.rotation * DVec3::Z;
+            // Camera axes: z points forward.
             let yaw = tenths(forward.y.atan2(forward.x).to_degrees());
+            // Rounding may make a component of a unit vector exceed 1, of which there is no arc
+            // sine.
             let pitch = tenths(forward.z.clamp(-1.0, 1.0).asin().to_degrees());
             writeln!(
                 out,
@@ -83,6 +86,7 @@ impl Show {
 
 /// Rounded as it is printed, without a minus before 0.0.
 fn tenths(value: f64) -> f64 {
+    // Adding 0 turns -0, which would be printed with its sign, into 0.
     (10.0 * value).round() / 10.0 + 0.0
 }
 

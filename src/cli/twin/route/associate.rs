@@ -41,6 +41,7 @@ impl Associate {
         let keyframes_us: Vec<i64> = trajectory.keyframes.iter().map(|k| k.time_us).collect();
         let found = route::associate(&times_us, &keyframes_us, self.tolerance_us)?;
         let mut residuals_us: Vec<i64> = found.pairs.iter().map(|pair| pair.residual_us).collect();
+        // With their signs: the median then shows a constant difference of the two clocks.
         residuals_us.sort_unstable();
         let pairs = found.pairs.iter().map(|pair| {
             json!({

@@ -44,6 +44,7 @@ impl Cut {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let trajectory = read_trajectory(&self.drive)?;
         let route = Route::new(&trajectory)?;
+        // Before anything is written: the second of two equal names would replace the first.
         self.check_labels()?;
         output::create_dir(&self.out)?;
         let mut index = Vec::new();

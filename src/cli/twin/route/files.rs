@@ -10,8 +10,8 @@ use wildcity_twin::ingest;
 
 /// Reads the times of another clock: a JSON list of whole microseconds.
 pub(super) fn read_times_us(path: &Path) -> anyhow::Result<Vec<i64>> {
-    let text = ingest::read_whole(path, limits::SETTINGS_FILE_BYTES);
-    let text = text.with_context(|| format!("--times {}", path.display()))?;
+    let text = ingest::read_whole(path, limits::SETTINGS_FILE_BYTES)
+        .with_context(|| format!("--times {}", path.display()))?;
     serde_json::from_slice(&text).with_context(|| {
         format!(
             "--times {}: expected a JSON list of whole microseconds, for example [0, 100000]",

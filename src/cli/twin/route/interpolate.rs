@@ -37,8 +37,10 @@ impl Interpolate {
         let route = Route::new(&trajectory)?;
         let keyframe_at =
             |time_us| Ok(Keyframe { time_us, world_from_rig: route.pose_at(time_us)? });
-        let keyframes = read_times_us(&self.times)?.into_iter().map(keyframe_at);
-        let keyframes = keyframes.collect::<anyhow::Result<_>>()?;
+        let keyframes = read_times_us(&self.times)?
+            .into_iter()
+            .map(keyframe_at)
+            .collect::<anyhow::Result<_>>()?;
         let resampled = Trajectory { name: trajectory.name.clone(), keyframes };
         resampled.check()?;
         output::write(&self.out, &to_json(&resampled)?)

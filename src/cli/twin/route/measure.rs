@@ -30,6 +30,7 @@ impl Measure {
     pub(super) fn run(self) -> anyhow::Result<()> {
         let trajectory = read_trajectory(&self.drive)?;
         let route = Route::new(&trajectory)?;
+        // A file without keyframes was refused by `Route::new`.
         let first = &trajectory.keyframes[0];
         let last = &trajectory.keyframes[trajectory.keyframes.len() - 1];
         let seconds = last.time_us.abs_diff(first.time_us) as f64 * 1e-6;

@@ -159,7 +159,8 @@ impl Tables {
             let pinhole = &camera.camera.pinhole;
             // nuScenes counts pixels from the middle of the first one, this project from its
             // corner.
-            let [cx, cy] = [pinhole.cx - 0.5, pinhole.cy - 0.5];
+            let cx = pinhole.cx - 0.5;
+            let cy = pinhole.cy - 0.5;
             let mount = &camera.rig_from_camera;
             let row = json!({
                 "token": self.token("calibrated_sensor", index),
@@ -254,8 +255,8 @@ impl Tables {
         // The origin of an actor is on the ground.
         let up = Pose { position_m: [0.0, 0.0, 0.5 * height].into(), ..Pose::IDENTITY };
         let center = state.world_from_actor * up;
-        let attributes = attribute(actor.class, state.velocity_mps.length() > MOVING_MPS);
-        let attributes = attributes.map(|index| self.token("attribute", index));
+        let attributes = attribute(actor.class, state.velocity_mps.length() > MOVING_MPS)
+            .map(|index| self.token("attribute", index));
         let row = json!({
             "token": self.token("sample_annotation", this),
             "sample_token": self.token("sample", sample),
