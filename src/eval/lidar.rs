@@ -253,11 +253,12 @@ fn pose_at(poses: &[Keyframe], time_us: i64) -> Option<Pose> {
         return Some(before.world_from_rig);
     }
     let next = poses.get(after)?;
-    let gap_us = next.time_us - before.time_us;
-    if gap_us > LARGEST_GAP_US {
+    // Times of a file may be any: the difference of two would overflow.
+    let gap_us = next.time_us.abs_diff(before.time_us);
+    if gap_us > LARGEST_GAP_US as u64 {
         return None;
     }
-    let share = (time_us - before.time_us) as f64 / gap_us as f64;
+    let share = time_us.abs_diff(before.time_us) as f64 / gap_us as f64;
     let a = before.world_from_rig;
     let b = next.world_from_rig;
     let rotation = slerp(a.rotation, b.rotation, share);
@@ -500,4 +501,16 @@ fn times(file: &SafeTensors<'_>, name: &'static str) -> Result<Option<Vec<i64>>,
     // The length is a multiple of 8, which safetensors checks against shape and type.
     let (values, _) = tensor.data().as_chunks::<8>();
     Ok(Some(values.iter().map(|value| i64::from_le_bytes(*value)).collect()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn poses_at_the_ends_of_time_are_a_gap() {
+        let at = |time_us: i64| Keyframe { time_us, world_from_rig: Pose::IDENTITY };
+        assert_eq!(pose_at(&[at(i64::MIN), at(i64::MAX)], 0), None);
+        assert_eq!(pose_at(&[at(0), at(100)], 50), Some(Pose::IDENTITY));
+    }
 }

@@ -226,11 +226,12 @@ fn read_json<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T, LogError>
 
 /// Reads a file of at most `limit` bytes.
 pub(crate) fn read_whole(path: &Path, limit: u64) -> Result<Vec<u8>, LogError> {
-    let file = File::open(path).map_err(|error| LogError::file(path, &error))?;
-    let is_file = fs::metadata(path).is_ok_and(|metadata| metadata.is_file());
-    if !is_file {
+    // Before it is opened: to open a FIFO waits for another process that writes.
+    let metadata = fs::metadata(path).map_err(|error| LogError::file(path, &error))?;
+    if !metadata.is_file() {
         return Err(LogError::malformed(path, "it is not a file"));
     }
+    let file = File::open(path).map_err(|error| LogError::file(path, &error))?;
     let mut bytes = Vec::new();
     // Not the length that the system states: the file may grow while it is read.
     let read = file.take(limit + 1).read_to_end(&mut bytes);

@@ -99,6 +99,12 @@ pub(crate) fn read(
         files.iter().map(|file| ingest::may_name_others(&file.path).unwrap_or(false)).collect();
     // A file whose head cannot be read names no other; its own reader then reports why.
     for is_first in [true, false] {
+        // A part may itself look like a scene, such as a description of a block that another one
+        // names later: what is a part is known only when all scenes that name others were read.
+        if !is_first {
+            reader.drop_parts();
+            reader.joins_at_once = true;
+        }
         for (index, requested) in requested.iter().enumerate() {
             if names_others[index] == is_first && !reader.parts.contains(&files[index].name) {
                 reader.read(index, requested)?;
@@ -140,6 +146,8 @@ struct Reader<'a> {
     antialiasing: Vec<Option<Antialiasing>>,
     /// Index of the next file to join.
     next: usize,
+    /// Whether a scene is joined as soon as all scenes before it are.
+    joins_at_once: bool,
     scene: PushedScene,
 }
 
@@ -173,6 +181,7 @@ impl<'a> Reader<'a> {
             read: BTreeMap::new(),
             antialiasing: Vec::new(),
             next: 0,
+            joins_at_once: false,
             scene: PushedScene {
                 gaussians: Gaussians::default(),
                 hashes: Vec::with_capacity(files.len()),
@@ -242,10 +251,16 @@ impl<'a> Reader<'a> {
         self.parts.extend(read.parts.iter().cloned());
         self.read.insert(index, read);
         // Joining at once keeps one scene in memory beside the joined one, and not all of them.
-        if index == self.next {
+        if self.joins_at_once && index == self.next {
             self.join_read(index + 1)?;
         }
         Ok(())
+    }
+
+    /// Drops the scenes that were read of files that are parts of others.
+    fn drop_parts(&mut self) {
+        let Self { files, parts, read, .. } = self;
+        read.retain(|index, _| !parts.contains(&files[*index].name));
     }
 
     /// Joins the scenes that were read of the files before `end`.

@@ -90,10 +90,14 @@ impl SourceAxes {
                 options.join(" ")
             ));
         }
-        let scale = scales.first().and_then(|scale| scale.parse().ok());
-        Self::given(axes.first().copied(), scale).map_err(|error| {
+        let unreadable = |error: String| {
             format!("give axes and scale: those of the twin cannot be read: {error}")
-        })
+        };
+        let scale = scales.first().map(|scale| {
+            scale.parse().map_err(|error| unreadable(format!("scale {scale:?}: {error}")))
+        });
+        Self::given(axes.first().copied(), scale.transpose()?)
+            .map_err(|error| unreadable(error.to_string()))
     }
 
     /// Whether both are given.

@@ -15,7 +15,7 @@ use prometheus_client::metrics::histogram::{Histogram, exponential_buckets};
 use prometheus_client::metrics::info::Info;
 use prometheus_client::registry::{Registry, Unit};
 
-use wildcity_session::{DeviceLoad, Engine, Polls};
+use wildcity_session::{Engine, Polls};
 
 use crate::process::Process;
 
@@ -194,15 +194,17 @@ struct Devices(Arc<Engine>);
 impl Collector for Devices {
     fn encode(&self, mut encoder: DescriptorEncoder<'_>) -> Result<(), std::fmt::Error> {
         let loads = self.0.device_loads();
-        let counts: [(&str, &str, fn(&DeviceLoad) -> usize); 2] = [
-            ("device_sessions", "Sessions by the device that draws them", |load| load.sessions),
-            ("device_frames_queued", "Frames in the queue of a device", |load| load.queued_frames),
-        ];
-        for (name, help, count) in counts {
+        // Read once, so that the numbers of one answer belong together.
+        let sessions = loads.iter().map(|load| load.sessions).collect::<Vec<_>>();
+        let queued = loads.iter().map(|load| load.queued_frames).collect();
+        for (name, help, counts) in [
+            ("device_sessions", "Sessions by the device that draws them", sessions),
+            ("device_frames_queued", "Frames in the queue of a device", queued),
+        ] {
             let mut gauge = encoder.encode_descriptor(name, help, None, MetricType::Gauge)?;
-            for (device, load) in loads.iter().enumerate() {
+            for (device, count) in counts.into_iter().enumerate() {
                 let labels = [("device", device.to_string())];
-                gauge.encode_family(&labels)?.encode_gauge(&(count(load) as i64))?;
+                gauge.encode_family(&labels)?.encode_gauge(&(count as i64))?;
             }
         }
         Ok(())

@@ -63,6 +63,10 @@ fn a_log_is_split_into_logs_with_marks() {
     let drive: Trajectory =
         serde_json::from_value(json(&street.at("parts/drives/log-25m-0000.json"))).unwrap();
     assert!((drive.length_m() - 25.0).abs() < 1e-6, "{}", drive.length_m());
+    // Its 50 m are two chunks of 25 m, and no third one of nothing.
+    street.done(&["log", "split", "log", "--out", "halves", "--chunk-m", "25"]);
+    let halves = json(&street.at("halves/split.json"));
+    assert_eq!(halves["chunks"].as_array().unwrap().len(), 2, "{halves:#}");
     let again = street.refused(&["log", "split", "log", "--out", "parts"]);
     assert!(again.contains("parts exists"), "{again}");
 }

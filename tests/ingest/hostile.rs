@@ -106,6 +106,11 @@ fn counts_that_no_file_holds_are_refused_before_memory_is_allocated() {
         (changed(ksplat(&g, 0), 4096 + 4, &huge), ".ksplat body: the header promises 188978"),
         (changed(ksplat(&g, 1), 4096 + 12, &huge), ".ksplat body: the header promises 515396"),
         (changed(ksplat(&g, 1), 4096 + 8, &[0; 4]), ".ksplat header, section 0: its Gaussian 2 is"),
+        // Buckets of 4 bytes, also without any Gaussian.
+        (
+            changed(changed(ksplat(&g, 1), 4096 + 20, &[4, 0]), 4096, &[0; 4]),
+            ".ksplat header, section 0: buckets of 4 bytes; a centre takes 12",
+        ),
     ];
     for (file, wanted) in cases {
         let text = refusal(&file);

@@ -246,3 +246,13 @@ fn an_unfinished_log_leaves_nothing() {
     let said = LogWriter::create(&at, &header(), &rig).unwrap_err().to_string();
     assert!(said.contains("log exists: give another folder"), "{said}");
 }
+
+#[test]
+fn a_fifo_is_no_log() {
+    let dir = tempfile::tempdir().unwrap();
+    let pipe = dir.path().join("log.json");
+    assert!(std::process::Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+    // Nothing writes into it: a reader would wait for ever.
+    let said = Log::open(dir.path()).unwrap_err().to_string();
+    assert!(said.contains("it is not a file"), "{said}");
+}

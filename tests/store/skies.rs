@@ -147,14 +147,36 @@ fn a_damaged_sky_is_found_and_repaired() {
     assert!(catalog.sky(&version).unwrap().is_some());
 }
 
+/// A sky that no map of the default error has.
+fn sharp_sky() -> SkyBytes {
+    let mut noise = tensors(1);
+    noise[0].2.iter_mut().for_each(|weight| *weight *= 1e4);
+    let bytes = ingest::sky::read_bytes(&safetensors(&noise, &[]), None).unwrap().bytes;
+    SkyBytes { bytes: bytes.into(), ..sky_bytes(1) }
+}
+
+#[test]
+fn a_profile_that_the_kept_sky_cannot_be_drawn_with_is_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let catalog = Catalog::open(dir.path()).unwrap();
+    let scene = gaussians(300, 0, 10.0, 1);
+    let profile = RenderProfile { sky_error: 0.0, ..RenderProfile::DEFAULT };
+    let sky = Some(NewSky::Put(sharp_sky()));
+    catalog.commit(NewVersion { sky, profile, ..street(&scene) }, &mut |_, _| {}).unwrap();
+    let change = |profile: RenderProfile| {
+        let commit = catalog.begin("street", CommitKind::Push, storage()).unwrap();
+        commit.change(1, VersionChange { profile: Some(profile), ..cells_alone() })
+    };
+    let error = change(RenderProfile::DEFAULT).unwrap_err().to_string();
+    assert!(error.contains("set sky_error to"), "{error}");
+    assert_eq!(change(RenderProfile { near: 0.2, ..profile }).unwrap().number, 2);
+}
+
 #[test]
 fn what_cannot_be_drawn_is_refused_before_anything_is_written() {
     let dir = tempfile::tempdir().unwrap();
     let scene = gaussians(300, 0, 10.0, 1);
-    let mut noise = tensors(1);
-    noise[0].2.iter_mut().for_each(|weight| *weight *= 1e4);
-    let bytes = ingest::sky::read_bytes(&safetensors(&noise, &[]), None).unwrap().bytes;
-    let sharp = SkyBytes { bytes: bytes.into(), ..sky_bytes(1) };
+    let sharp = sharp_sky();
     let garbage = SkyBytes { bytes: b"no sky".as_slice().into(), ..sky_bytes(1) };
     let image = SkyBytes { image: Some(0), ..sky_bytes(1) };
     for (sky, wanted) in [

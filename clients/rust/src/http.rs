@@ -178,7 +178,7 @@ impl HttpClient {
                     unanswered = 0;
                     push = next;
                 }
-                Err(HttpError::NoAnswer { .. }) if unanswered < limits::HTTP_ATTEMPTS => {
+                Err(HttpError::NoAnswer { .. }) if unanswered + 1 < limits::HTTP_ATTEMPTS => {
                     unanswered += 1;
                 }
                 Err(error) => return Err(error),

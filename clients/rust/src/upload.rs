@@ -49,13 +49,14 @@ impl HttpClient {
                 Err(error) if is_transient(&error) => furthest,
                 Err(error) => return Err(error),
             };
-            failures = if offset > furthest { 0 } else { failures + 1 };
+            failures = if offset > furthest { 0_u32 } else { failures + 1 };
             furthest = furthest.max(offset);
             if failures >= limits::HTTP_ATTEMPTS {
                 return Err(failure);
             }
             // `failures` is less than HTTP_ATTEMPTS here, so that the power stays small.
-            tokio::time::sleep(limits::HTTP_RETRY_DELAY * 2_u32.pow(failures)).await;
+            let waits = 2_u32.pow(failures.saturating_sub(1));
+            tokio::time::sleep(limits::HTTP_RETRY_DELAY * waits).await;
         }
     }
 

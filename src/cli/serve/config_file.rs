@@ -202,7 +202,12 @@ impl Resolved {
 fn literal(text: &str) -> Value {
     let parsed = format!("x = {text}").parse::<Table>().ok().and_then(|mut one| one.remove("x"));
     match parsed {
-        Some(scalar @ (Value::Integer(_) | Value::Float(_) | Value::Boolean(_))) => scalar,
+        // Written as it was: a folder named 1_000 or 1e3 is no number.
+        Some(scalar @ (Value::Integer(_) | Value::Float(_) | Value::Boolean(_)))
+            if scalar.to_string() == text =>
+        {
+            scalar
+        }
         // What is not a number or a boolean of TOML is a text, also a date.
         _ => Value::String(text.to_owned()),
     }
@@ -279,13 +284,20 @@ mod tests {
 
     #[test]
     fn what_is_printed_can_be_fed_back() {
-        let flags = ["--memory-gib=0.1", "--listen=127.0.0.1:0", "--device", "a \"b\" \\ c"];
+        let flags = [
+            "--memory-gib=0.1",
+            "--listen=127.0.0.1:0",
+            "--device",
+            "a \"b\" \\ c",
+            "--audit-log=1e3",
+        ];
         let first = resolve_with("[limits]\nsessions = 7\n", &flags).unwrap().to_toml().unwrap();
         assert!(first.contains("\n[limits]\n") && first.contains("\nsessions = 7\n"), "{first}");
         assert!(first.contains("\nmemory_gib = 0.1\n"), "{first}");
         assert!(first.contains("\n# tokens is not set.\n"), "{first}");
         let table: Table = first.parse().unwrap();
         assert_eq!(table["device"].as_str(), Some("a \"b\" \\ c"));
+        assert_eq!(table["audit_log"].as_str(), Some("1e3"), "a file, and no number");
         let second = resolve_with(&first, &[]).unwrap().to_toml().unwrap();
         assert_eq!(first, second);
     }

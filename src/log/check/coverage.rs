@@ -69,8 +69,9 @@ impl<'a> Coverage<'a> {
         let finished = self.cameras.into_values().map(|Along { last_m, mut coverage }| {
             // The rest of the drive behind the last image is without one, too.
             coverage.longest_m = coverage.longest_m.max(length_m - last_m);
-            // A camera is listed with its first image, so this does not divide by 0.
-            coverage.spacing_m = length_m / coverage.images as f64;
+            // An image without a pose is nowhere along the drive.
+            let placed = coverage.images - coverage.unplaced;
+            coverage.spacing_m = length_m / placed.max(1) as f64;
             coverage
         });
         finished.collect()

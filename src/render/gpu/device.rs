@@ -184,12 +184,9 @@ impl AdapterChoice {
             Self::Named(choice) => {
                 let name = choice.to_lowercase();
                 let has_name = |info: &AdapterInfo| info.name.to_lowercase().contains(&name);
-                match choice.parse::<usize>() {
-                    // A number that no device has is an error, even if it is a part of a device's
-                    // name.
-                    Ok(number) => (number < found.len()).then_some(number),
-                    Err(_) => infos.iter().position(has_name),
-                }
+                // A number that no device has may be a part of a name, such as 4090.
+                let number = choice.parse().ok().filter(|number| *number < found.len());
+                number.or_else(|| infos.iter().position(has_name))
             }
         };
         match (index.and_then(|index| found.into_iter().nth(index)), self) {

@@ -304,7 +304,8 @@ impl Recorder {
     /// Copies the timestamps to a buffer. Returns the names of the stages in order.
     pub(super) fn finish_stages(&mut self, timestamps: &Buffer) -> Vec<&'static str> {
         if let Some(queries) = &self.timestamps {
-            let count = 2 * self.stages.len() as u32;
+            // Further stages have no timestamps.
+            let count = 2 * (self.stages.len() as u32).min(MAX_STAGES);
             self.encoder.resolve_query_set(queries, 0..count, timestamps, 0);
         }
         std::mem::take(&mut self.stages)

@@ -43,11 +43,13 @@ impl Route<'_> {
             let must = "it is from 0 to the length of the trajectory";
             return Err(RouteError::Value { field: "from_m", value: first_m, must });
         }
-        let last_m = to_m.unwrap_or(length_m).min(length_m);
+        let last_m = to_m.unwrap_or(length_m);
+        // Before the minimum, which a NaN would pass as the length.
         if !(first_m..).contains(&last_m) {
             let must = "it is not less than from_m";
             return Err(RouteError::Value { field: "to_m", value: last_m, must });
         }
+        let last_m = last_m.min(length_m);
         match every_m {
             Some(every_m) => self.interpolated(first_m, last_m, every_m),
             None => self.recorded(first_m, last_m),
@@ -152,6 +154,7 @@ mod tests {
         assert_eq!(field(9.5, 12.0, 1.0), "from_m");
         assert_eq!(field(f64::NAN, 3.0, 1.0), "from_m");
         assert_eq!(field(3.0, 2.0, 1.0), "to_m");
+        assert_eq!(field(3.0, f64::NAN, 1.0), "to_m");
         assert_eq!(field(0.0, 3.0, 0.0), "every_m");
         assert_eq!(field(0.0, 3.0, f64::INFINITY), "every_m");
         // 9 m / 0.8 mm are 11,250 poses.

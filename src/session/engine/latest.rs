@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 use parking_lot::Mutex;
 
 use super::Engine;
+use crate::blocking::run_blocking;
 use crate::limits;
 
 /// The last look at each twin, by its name.
@@ -65,9 +66,12 @@ impl Engine {
         if is_old {
             let engine = self.clone();
             let twin = twin.to_owned();
-            tokio::task::spawn_blocking(move || {
-                let latest = engine.cache.catalog().latest(&twin);
-                engine.latest.found(&twin, latest.ok());
+            tokio::spawn(async move {
+                let store = engine.clone();
+                let name = twin.clone();
+                let latest = run_blocking(move || store.cache.catalog().latest(&name)).await;
+                // Also after a panic: otherwise the twin would never be looked at again.
+                engine.latest.found(&twin, latest.ok().and_then(Result::ok));
             });
         }
         number

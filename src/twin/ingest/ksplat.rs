@@ -148,7 +148,8 @@ impl Section {
             let most = section.max_count;
             return Err(bad(&place, format!("{count} Gaussians, but room for {most}")));
         }
-        if header.level > 0 && section.count > 0 && section.bucket_bytes < 12 {
+        let has_centres = section.count > 0 || section.buckets > 0;
+        if header.level > 0 && has_centres && section.bucket_bytes < 12 {
             let bytes = section.bucket_bytes;
             return Err(bad(&place, format!("buckets of {bytes} bytes; a centre takes 12")));
         }
@@ -172,11 +173,15 @@ impl Section {
         }
         let mut centres_m: Vec<[f32; 3]> = Vec::new();
         let mut bucket = vec![0; self.bucket_bytes.into()];
-        for _ in 0..self.buckets {
-            input.read_exact(&mut bucket)?;
-            if header.level > 0 {
+        if header.level > 0 {
+            for _ in 0..self.buckets {
+                input.read_exact(&mut bucket)?;
                 centres_m.push([0, 4, 8].map(|at| f32::from_bits(u32_at(&bucket, at))));
             }
+        } else {
+            // Not one by one: buckets may have no bytes, and there may be four billion of them.
+            let bytes = u64::from(self.buckets) * u64::from(self.bucket_bytes);
+            io::copy(&mut input.by_ref().take(bytes), &mut io::sink())?;
         }
         let mut gaussians = Gaussians::with_capacity(self.sh_degree, self.count as usize);
         let mut record = vec![0; self.record_bytes];

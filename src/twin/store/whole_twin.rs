@@ -26,15 +26,18 @@ impl Catalog {
     /// twin. Versions that were garbage-collected are left out, and so numbers may change.
     ///
     /// # Errors
-    /// [`StoreError::TwinExists`]; [`StoreError::Leased`] if a version is in use; a version cannot
-    /// be read, or its copy cannot be written. Then the old twin is whole, and the new one has the
-    /// versions up to there.
+    /// [`StoreError::TwinExists`]; [`StoreError::Leased`] if a version is in use;
+    /// [`StoreError::Conflict`] if a version was committed meanwhile; a version cannot be read, or
+    /// its copy cannot be written. Then the old twin is whole, and the new one has the versions up
+    /// to there.
     pub fn rename(&self, from: &str, to: &str) -> Result<Version, StoreError> {
         self.check_new(to)?;
         self.check_unused(from)?;
         let gone = self.collected(from)?;
+        let entries = self.versions(from)?;
+        let known: BTreeSet<u64> = entries.iter().map(|entry| entry.number).collect();
         let mut last = None;
-        for entry in self.versions(from)? {
+        for entry in entries {
             // Its objects are removed, so that there is nothing to copy.
             if gone.contains(&entry.number) {
                 continue;
@@ -49,7 +52,7 @@ impl Catalog {
             last = Some(copied.number);
         }
         // Last, so that a copy that fails leaves the old twin whole.
-        self.remove(from)?;
+        self.remove_known(from, Some(&known))?;
         self.version(to, None)
     }
 
@@ -60,6 +63,11 @@ impl Catalog {
     /// [`StoreError::NoTwin`]; [`StoreError::Leased`] if a version is in use, and nothing is
     /// removed; or what cannot be removed.
     pub fn remove(&self, name: &str) -> Result<(), StoreError> {
+        self.remove_known(name, None)
+    }
+
+    /// As [`Catalog::remove`], if the twin has no versions but those that are known.
+    fn remove_known(&self, name: &str, known: Option<&BTreeSet<u64>>) -> Result<(), StoreError> {
         check_name(name)?;
         // Only for the error of a twin that does not exist.
         self.latest(name)?;
@@ -67,6 +75,10 @@ impl Catalog {
         self.objects.remove_twin(name, &mut || {
             // Publishing is locked, or this is an object store, where the last commit wins.
             let numbers: BTreeSet<u64> = self.objects.version_numbers(name)?.into_iter().collect();
+            // A version that was not copied would be lost.
+            if let Some(number) = known.and_then(|known| numbers.difference(known).next()) {
+                return Err(StoreError::Conflict { name: name.to_owned(), number: *number });
+            }
             self.mark_collected(name, &numbers, self.clock.now_us())
         })
     }

@@ -94,6 +94,10 @@ fn table(out: &mut impl Write, version: &Version) -> io::Result<()> {
     )?;
     for (level, Row { gaussians, bytes, mut errors_m }) in rows.into_iter().enumerate() {
         errors_m.sort_by(f32::total_cmp);
+        // A level between others may have no block.
+        if errors_m.is_empty() {
+            continue;
+        }
         let last = (errors_m.len() - 1) as f64;
         let quantile_m = |share: f64| errors_m[(last * share).round() as usize];
         let share = 100.0 * gaussians as f64 / manifest.gaussians() as f64;

@@ -106,13 +106,15 @@ impl Recorder<'_> {
     /// Records an image of each camera. Returns how many are kept.
     fn record_images(&self, turn: usize, us: i64, log: &mut LogWriter) -> anyhow::Result<usize> {
         let mut kept = 0;
+        // Within the turn, however many cameras there are: rows are in order of time.
+        let step_us = CAMERA_STEP_US.min(PERIOD_US / self.rig.cameras.len().max(1) as i64);
         for (index, mounted) in self.rig.cameras.iter().enumerate() {
             // Counted from 1: counted from 0, the first image would always be dropped.
             let number = turn * self.rig.cameras.len() + index + 1;
             if self.drop_every > 0 && number.is_multiple_of(self.drop_every) {
                 continue;
             }
-            self.record_image(mounted, us + CAMERA_STEP_US * index as i64, log)?;
+            self.record_image(mounted, us + step_us * index as i64, log)?;
             kept += 1;
         }
         Ok(kept)

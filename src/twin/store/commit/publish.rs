@@ -5,6 +5,7 @@ use std::collections::BTreeSet;
 
 use wildcity_scene::Manifest;
 
+use crate::ingest::IngestError;
 use crate::limits;
 use crate::store::diff::Diff;
 use crate::store::log::LogRecord;
@@ -84,8 +85,15 @@ impl Commit {
         let base = self.catalog.version(&self.name, Some(base))?;
         // The sky will be drawn with the profile of the new version: that of the change, or else
         // that of the base.
-        if let Some(Some(sky)) = &change.sky {
-            sky.check(&change.profile.unwrap_or(base.manifest.profile))?;
+        match (&change.sky, change.profile) {
+            (Some(Some(sky)), profile) => sky.check(&profile.unwrap_or(base.manifest.profile))?,
+            // The sky that is kept, too: no session could open a version whose sky is too coarse.
+            (None, Some(profile)) => {
+                if let Some(sky) = self.catalog.sky(&base)? {
+                    sky.drawable(profile.sky_error).map_err(IngestError::Sky)?;
+                }
+            }
+            (Some(None), _) | (None, None) => {}
         }
         self.publish(Some(base.number), |commit, latest| match latest {
             Some(latest) if latest != base.number => {
