@@ -152,7 +152,7 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
         engine,
         sessions: SessionRegistry::new(limits.sessions, limits.resume_grace),
         websocket_permits: Arc::new(Semaphore::new(limits.connections)),
-        scenario_listing: tokio::sync::Mutex::default(),
+        scenario_listing: Arc::default(),
         stopping,
         limits,
         profile,

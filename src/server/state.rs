@@ -47,8 +47,8 @@ pub(crate) struct ServerState {
     pub(crate) spool: Result<Arc<Spool>, String>,
     pub(crate) pushes: PushQueue,
     pub(crate) metrics: Metrics,
-    /// Held while the scenarios of a twin are listed.
-    pub(crate) scenario_listing: tokio::sync::Mutex<()>,
+    /// Held by the work that lists the scenarios of a twin, which may outlive its request.
+    pub(crate) scenario_listing: Arc<tokio::sync::Mutex<()>>,
 }
 
 impl ServerState {

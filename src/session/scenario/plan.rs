@@ -36,12 +36,16 @@ impl Scenarios {
     /// it says no twin. A map is omitted that cannot be read, that has more than
     /// [`limits::PLANNED_MAP_BYTES`], or with which all have more than
     /// [`limits::PLANNED_MAPS_BYTES`]; opening the scenario says what is wrong.
-    pub fn in_twin(&self, twin: &str) -> TwinScenarios {
+    /// `None` if the listing is not wanted any more, which is asked before each file.
+    pub fn in_twin(&self, twin: &str, is_wanted: &dyn Fn() -> bool) -> Option<TwinScenarios> {
         let names = self.names();
         let omitted_scenarios = names.len().saturating_sub(limits::PLANNED_SCENARIOS);
         let mut found = TwinScenarios { omitted_scenarios, ..TwinScenarios::default() };
         let mut left_bytes = limits::PLANNED_MAPS_BYTES;
         for name in names.into_iter().take(limits::PLANNED_SCENARIOS) {
+            if !is_wanted() {
+                return None;
+            }
             let source = ScenarioSource::Named(name.clone());
             let Ok(file) = self.file(&source, &BTreeMap::new()) else { continue };
             if file.twin.name != twin {
@@ -60,7 +64,7 @@ impl Scenarios {
             }
             found.scenarios.push(PlannedScenario { name, map });
         }
-        found
+        Some(found)
     }
 
     /// The lanes of a map; `None` if it cannot be read, or is longer than a map may be or than what
@@ -88,4 +92,27 @@ fn outlines(map: &MapFile) -> Vec<Vec<[f64; 2]>> {
     driving
         .map(|lane| lane.left.iter().chain(lane.right.iter().rev()).map(flat).collect())
         .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_listing_ends_when_nobody_wants_it() {
+        let dir = tempfile::tempdir().unwrap();
+        for name in ["a", "b"] {
+            let text = format!(
+                r#"{{"format": "wildcity.scenario/1", "name": "{name}", "twin": {{"name": "t"}}, "actors": []}}"#
+            );
+            std::fs::write(dir.path().join(format!("{name}.json")), text).unwrap();
+        }
+        let scenarios = Scenarios::in_dir(dir.path());
+        assert_eq!(scenarios.in_twin("t", &|| true).unwrap().scenarios.len(), 2);
+        // Wanted for the first file alone.
+        let asked = std::cell::Cell::new(0);
+        let is_wanted = || asked.replace(asked.get() + 1) == 0;
+        assert_eq!(scenarios.in_twin("t", &is_wanted), None);
+        assert_eq!(asked.get(), 2);
+    }
 }
