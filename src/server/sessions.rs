@@ -280,7 +280,14 @@ impl SessionRegistry {
         }
         // Clients can open and close as often as they like, so the map has a bound.
         if closed.len() >= self.limit {
-            let oldest = closed.iter().min_by_key(|(_, session)| session.since);
+            // Of the token that has the most, so that none loses its answers to others.
+            let mut counts: BTreeMap<&str, usize> = BTreeMap::new();
+            for session in closed.values() {
+                *counts.entry(&session.owner).or_default() += 1;
+            }
+            let most = counts.into_iter().max_by_key(|(_, count)| *count).map(|(owner, _)| owner);
+            let of_most = closed.iter().filter(|(_, session)| most == Some(&*session.owner));
+            let oldest = of_most.min_by_key(|(_, session)| session.since);
             if let Some(name) = oldest.map(|(name, _)| name.clone()) {
                 closed.remove(&name);
             }
@@ -537,5 +544,29 @@ mod tests {
         drop(open);
         remember();
         assert!(is_kept());
+    }
+
+    /// A token that closes many sessions loses its own answers to `close`, and not those of others.
+    #[test]
+    fn answers_to_close_give_way_to_those_of_the_same_token() {
+        let registry = SessionRegistry::new(4, Duration::from_secs(60));
+        let summary = EpisodeSummary {
+            outcome: Outcome::Completed,
+            steps: 1,
+            time_us: 100_000,
+            distance_m: 1.0,
+            least_trust: None,
+        };
+        let remember = |name: &str, owner: &str| {
+            let last = AnsweredRequest { seq: 3, answer: Answer::Text("closed".into()) };
+            registry.remember_closed(name.to_owned(), owner, last, &summary);
+        };
+        remember("anns", "ann");
+        for index in 0..9 {
+            remember(&format!("bobs-{index}"), "bob");
+        }
+        assert!(registry.closed("anns", "ann").is_some());
+        assert!(registry.closed("bobs-8", "bob").is_some());
+        assert!(registry.closed("bobs-0", "bob").is_none(), "the oldest of its token");
     }
 }
