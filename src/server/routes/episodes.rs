@@ -116,7 +116,7 @@ fn reserve(state: &ServerState, path: &std::path::Path) -> Result<BudgetShare, F
     state.engine.reserve_answer_bytes(bytes).map_err(Fault::from)
 }
 
-/// A file with its share of the memory for answers.
+/// Bytes with their share of the memory for answers.
 struct CountedFile {
     bytes: Vec<u8>,
     _share: BudgetShare,
@@ -128,7 +128,7 @@ impl AsRef<[u8]> for CountedFile {
     }
 }
 
-fn counted(bytes: Vec<u8>, share: BudgetShare) -> Bytes {
+pub(super) fn counted(bytes: Vec<u8>, share: BudgetShare) -> Bytes {
     Bytes::from_owner(CountedFile { bytes, _share: share })
 }
 

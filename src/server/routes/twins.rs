@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use axum::body::Bytes;
 use axum::extract::{Path, RawQuery, State};
+use axum::http::header;
 use axum::response::IntoResponse as _;
 use axum::{Extension, Json};
 
@@ -18,6 +19,7 @@ use crate::convert;
 use crate::fault::Fault;
 use crate::state::ServerState;
 
+use super::episodes::counted;
 use super::refusal::HttpResult;
 
 /// `GET /v1/twins`: the latest version of every twin that the token may use, and the damaged ones
@@ -77,12 +79,18 @@ pub(super) async fn trajectory(
     // The version that a session would open now, which is not yet the one that a push has just
     // committed.
     let version = version.or_else(|| state.engine.pinned_latest(&twin));
-    let catalog = state.engine.catalog().clone();
+    // The turn belongs to the work, which goes on when the client leaves.
+    let turn = state.drive_turns.clone().acquire_owned().await;
+    let turn = turn.map_err(|error| Fault::Internal(error.to_string()))?;
     let body = blocking(move || {
-        let version = catalog.version(&twin, version).map_err(Fault::from)?;
-        convert::drive_body(&version, &section)
+        let _turn = turn;
+        let version = state.engine.catalog().version(&twin, version).map_err(Fault::from)?;
+        let json = convert::drive_body(&version, &section)?;
+        // As long as the client has not taken it.
+        let share = state.engine.reserve_answer_bytes(json.len() as u64).map_err(Fault::from)?;
+        Ok::<_, Fault>(counted(json, share))
     });
-    Ok(Json(body.await?).into_response())
+    Ok(([(header::CONTENT_TYPE, "application/json")], body.await?).into_response())
 }
 
 /// `GET /v1/twins/{twin}/ground`: where the latest version is, and the ground that it seems to
