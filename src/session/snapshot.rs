@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use parking_lot::Mutex;
 
+use crate::engine::answer_budget::BudgetShare;
 use crate::error::SessionError;
 use crate::limits;
 use crate::record::format::RecordedOrigin;
@@ -18,6 +19,9 @@ pub struct Snapshot {
     pub(crate) state: EpisodeState,
     /// Where the state was reached; absent if no frame of the episode is on record yet.
     pub(crate) origin: Option<RecordedOrigin>,
+    /// The share of the budget for answers that the copy of the state takes: 16,384 triggers take
+    /// megabytes.
+    pub(crate) _share: BudgetShare,
 }
 
 /// The snapshots of a session, by name. Copies share them, so that other sessions can be opened

@@ -131,4 +131,10 @@ impl EpisodeState {
         let frame_history = FrameHistory::default();
         Self { episode, frame_history, traffic: None, events: Vec::new() }
     }
+
+    /// Bytes that a copy does not share with its original, in addition to its frames.
+    pub(crate) fn copied_bytes(&self) -> u64 {
+        let traffic = self.traffic.as_ref().map_or(0, EpisodeTraffic::copied_bytes);
+        (traffic + size_of_val(&*self.events)) as u64
+    }
 }

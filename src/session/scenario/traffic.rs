@@ -126,6 +126,11 @@ impl EpisodeTraffic {
         }
     }
 
+    /// Bytes that a copy does not share with its original.
+    pub(crate) fn copied_bytes(&self) -> usize {
+        self.world.copied_bytes()
+    }
+
     /// Sets how old the pictures of sensors may be, in microseconds.
     pub(crate) fn with_reach(self, reach_us: i64) -> Self {
         Self { reach_us, ..self }

@@ -13,6 +13,7 @@ use super::pending::{EpisodeFile, NewEpisode, Pending};
 use super::requests::SimulationState;
 use crate::blocking::run_blocking;
 use crate::engine::Engine;
+use crate::engine::answer_budget::BudgetShare;
 use crate::error::SessionError;
 use crate::observe::encode::PixelMaps;
 use crate::observe::layout::ObservationLayout;
@@ -31,12 +32,13 @@ impl Session {
     /// Stores the present state under a name, in place of an earlier snapshot of that name.
     ///
     /// # Errors
-    /// There are too many snapshots.
+    /// There are too many snapshots, or too little memory for the state.
     pub fn take_snapshot(&self, name: String) -> Result<(), SessionError> {
-        self.snapshots.store(name, self.present())
+        let share = self.engine.answer_budget().reserve(self.state.copied_bytes())?;
+        self.snapshots.store(name, self.present(share))
     }
 
-    fn present(&self) -> Snapshot {
+    fn present(&self, share: BudgetShare) -> Snapshot {
         let step = self.state.episode.step();
         // Without a file, no frame of this episode is on record: a branch has the origin that the
         // episode has.
@@ -49,6 +51,7 @@ impl Session {
             version: self.version.clone(),
             state: self.state.clone(),
             origin: recorded.or_else(|| self.origin.clone()),
+            _share: share,
         }
     }
 
@@ -110,7 +113,7 @@ impl Session {
         name: String,
         from: &Snapshot,
     ) -> Result<Self, SessionError> {
-        let Snapshot { settings, version, state, origin } = from;
+        let Snapshot { settings, version, state, origin, .. } = from;
         let extent = layout_extent(&settings.layout);
         let frame = frame_bytes(&engine, &settings.layout, version);
         // Memory for its own frames: a branch lives on without the session that it comes from.

@@ -12,7 +12,7 @@ mod triggers;
 use std::ops::ControlFlow;
 use std::sync::Arc;
 
-use self::progress::ActorProgress;
+use self::progress::{ActorProgress, FiredTrigger};
 use self::triggers::EndState;
 use super::behaviour::{Behaviour, Motion, MotionStep, absent};
 use super::ego_motion::EgoMotion;
@@ -91,6 +91,17 @@ impl World {
             firings: Vec::new(),
             end: EndState::default(),
         }
+    }
+
+    /// Bytes that a copy does not share with its original, but for the values that conditions
+    /// remember.
+    pub fn copied_bytes(&self) -> usize {
+        let triggers: usize = self.progress.iter().map(|actor| actor.fired.len()).sum();
+        size_of_val(&*self.states)
+            + size_of_val(&*self.progress)
+            + triggers * size_of::<FiredTrigger>()
+            + size_of_val(&*self.travelled_m)
+            + size_of_val(&*self.waiting)
     }
 
     /// The actors as they were set up.
