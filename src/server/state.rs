@@ -47,6 +47,8 @@ pub(crate) struct ServerState {
     pub(crate) spool: Result<Arc<Spool>, String>,
     pub(crate) pushes: PushQueue,
     pub(crate) metrics: Metrics,
+    /// Turns of messages that are parsed on threads that may block.
+    pub(crate) parse_turns: Arc<Semaphore>,
     /// Turns of requests for parts of drives.
     pub(crate) drive_turns: Arc<Semaphore>,
     /// Held by the work that lists the scenarios of a twin, which may outlive its request.

@@ -175,7 +175,13 @@ impl Connection {
             convert::parse(text)
         } else {
             let text = text.to_owned();
-            let parsed = tokio::task::spawn_blocking(move || convert::parse(&text)).await;
+            // The turn belongs to the work, which goes on if this future is dropped.
+            let turn = self.state.parse_turns.clone().acquire_owned().await;
+            let parse = move || {
+                let _turn = turn;
+                convert::parse(&text)
+            };
+            let parsed = tokio::task::spawn_blocking(parse).await;
             parsed.unwrap_or_else(|error| Parsed::Unnumbered(Fault::Internal(error.to_string())))
         };
         let (seq, session, command) = match parsed {
