@@ -155,6 +155,9 @@ pub const RECORDS_BYTES: u64 = 64 << 30;
 /// Bytes of the records of one token.
 pub const TOKEN_RECORDS_BYTES: u64 = 32 << 30;
 
+/// Bytes of the head of a request, and of what is read of a connection ahead.
+pub const HEAD_BYTES: usize = 64 << 10;
+
 /// Parts of drives that are made for HTTP at once. One of 10,000 poses took 45 ms of a
 /// processor.
 pub const DRIVES_AT_ONCE: usize = 2;
@@ -162,8 +165,9 @@ pub const DRIVES_AT_ONCE: usize = 2;
 /// Time between two looks for records that are beyond a limit: each lists the directory.
 pub const PRUNE_PERIOD: Duration = Duration::from_secs(60);
 
-/// Share of all sessions that a token without a limit of its own leaves to others: one in four.
-pub const SESSIONS_FOR_OTHERS: usize = 4;
+/// Share of all sessions, and of all connections, that a token without a limit of its own leaves to
+/// others: one in four.
+pub const LEFT_TO_OTHERS: usize = 4;
 
 /// Recorded episodes that are listed over HTTP: each file is read for it.
 pub const LISTED_EPISODES: usize = 100;

@@ -107,6 +107,7 @@ impl Acceptor {
             let _ = http1::Builder::new()
                 .timer(TokioTimer::new())
                 .header_read_timeout(hello)
+                .max_buf_size(limits::HEAD_BYTES)
                 .serve_connection(TokioIo::new(stream), TowerToHyperService::new(app))
                 .with_upgrades()
                 .await;

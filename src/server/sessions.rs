@@ -203,7 +203,7 @@ impl SessionRegistry {
         let own = entries.values().filter(|entry| entry.owner == grant.name).count();
         // All clients of a server without tokens are one owner, and have all sessions.
         let left_to_others =
-            if grant.name.is_empty() { 0 } else { self.limit / limits::SESSIONS_FOR_OTHERS };
+            if grant.name.is_empty() { 0 } else { self.limit / limits::LEFT_TO_OTHERS };
         let limit = grant.limits.sessions.unwrap_or(self.limit - left_to_others);
         if own >= limit {
             return Err(Fault::Busy { what: "sessions of this token", limit });

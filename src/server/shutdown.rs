@@ -86,12 +86,15 @@ async fn renew_leases(state: &ServerState) {
     }
 }
 
-/// Gives memory that evicted sections and pushes no longer need back to the operating system, until
-/// dropped.
+/// Gives memory that evicted sections, pushes and sessions no longer need back to the operating
+/// system, until dropped.
 async fn release_memory(state: &ServerState) {
     // Each release walks the whole heap, so it is done only if something was freed since the last
     // one.
-    let changes = || (state.engine.residency().evictions, state.pushes.changes());
+    let changes = || {
+        let sessions = state.engine.session_changes();
+        (state.engine.residency().evictions, state.pushes.changes(), sessions)
+    };
     let mut before = changes();
     loop {
         tokio::time::sleep(state.limits.memory_release).await;

@@ -7,6 +7,7 @@ use parking_lot::Mutex;
 
 use crate::auth::Grant;
 use crate::fault::Fault;
+use crate::limits;
 
 /// Number of operations of one kind, by token.
 #[derive(Clone, Debug, Default)]
@@ -28,12 +29,16 @@ impl TokenCounts {
         self.begin(grant, grant.limits.pushes, "pushes of this token")
     }
 
-    /// Counts one more WebSocket connection of a token.
+    /// Counts one more WebSocket connection of a token, of `all` that there may be. One without a
+    /// limit of its own leaves some of them to others.
     ///
     /// # Errors
     /// [`Fault::Busy`]: the token's limit is reached.
-    pub(crate) fn connection(&self, grant: &Grant) -> Result<Counted, Fault> {
-        self.begin(grant, grant.limits.connections, "connections of this token")
+    pub(crate) fn connection(&self, grant: &Grant, all: usize) -> Result<Counted, Fault> {
+        // All clients of a server without tokens are one owner, and have all connections.
+        let share = (!grant.name.is_empty()).then(|| all - all / limits::LEFT_TO_OTHERS);
+        let limit = grant.limits.connections.or(share);
+        self.begin(grant, limit, "connections of this token")
     }
 
     fn begin(
@@ -89,5 +94,13 @@ mod tests {
         let _others: Vec<Counted> = (0..9).map(|_| pushes.push(&b).unwrap()).collect();
         drop(first);
         assert!(pushes.push(&a).is_ok());
+        // A token leaves a quarter of all connections to others; without tokens there are none.
+        let connections = TokenCounts::default();
+        let _own: Vec<Counted> = (0..6).map(|_| connections.connection(&a, 8).unwrap()).collect();
+        assert!(matches!(connections.connection(&a, 8), Err(Fault::Busy { limit: 6, .. })));
+        assert!(connections.connection(&b, 8).is_ok());
+        let anyone = Grant { name: String::new(), ..(*a).clone() };
+        let _all: Vec<Counted> =
+            (0..8).map(|_| connections.connection(&anyone, 8).unwrap()).collect();
     }
 }

@@ -248,11 +248,16 @@ fn an_unfinished_log_leaves_nothing() {
 }
 
 #[test]
-fn a_fifo_is_no_log() {
+fn a_fifo_is_no_sweep() {
     let dir = tempfile::tempdir().unwrap();
-    let pipe = dir.path().join("log.json");
-    assert!(std::process::Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+    let at = dir.path().join("log");
+    write(&at);
+    let log = Log::open(&at).unwrap();
+    let row = log.sweeps().unwrap().unwrap().next().unwrap().unwrap();
+    let path = log.path(&row.file);
+    fs::remove_file(&path).unwrap();
+    assert!(std::process::Command::new("mkfifo").arg(&path).status().unwrap().success());
     // Nothing writes into it: a reader would wait for ever.
-    let said = Log::open(dir.path()).unwrap_err().to_string();
+    let said = log.points(&row).unwrap_err().to_string();
     assert!(said.contains("it is not a file"), "{said}");
 }

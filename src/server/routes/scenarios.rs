@@ -34,6 +34,7 @@ pub(super) async fn list(
 pub(super) async fn in_twin(
     Shared(state): Shared<Arc<ServerState>>,
     Extension(deadline): Extension<Arc<IdleDeadline>>,
+    Extension(grant): Extension<Arc<Grant>>,
     Path(twin): Path<String>,
 ) -> HttpResult {
     let scenarios = state.engine.scenarios().clone();
@@ -52,8 +53,14 @@ pub(super) async fn in_twin(
             // A misspelt twin is an error, and not one without scenarios.
             catalog.version(&twin, None).map_err(Fault::from)?;
             let is_wanted = || asked.strong_count() > 0 && Instant::now() < end;
-            let listed = scenarios.in_twin(&twin, &is_wanted);
-            listed.ok_or_else(|| Fault::from(SessionError::DeadlineExceeded))
+            let mut listed = scenarios
+                .in_twin(&twin, &is_wanted)
+                .ok_or_else(|| Fault::from(SessionError::DeadlineExceeded))?;
+            // They may be of twins that the token may not see.
+            if !grant.allows_all_twins() {
+                listed.omitted_scenarios = 0;
+            }
+            Ok::<_, Fault>(listed)
         });
         let listed = listed.await;
         // Until here, so that the work is wanted as long as this future waits for it.

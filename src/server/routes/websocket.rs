@@ -91,7 +91,7 @@ impl Slots {
         grant: &Grant,
     ) -> Result<Self, Fault> {
         // The token's own limit first, so that its error is the one that is named.
-        let of_token = state.open_connections.connection(grant)?;
+        let of_token = state.open_connections.connection(grant, state.limits.connections)?;
         let limit = state.limits.connections;
         let of_server = state
             .websocket_permits

@@ -95,6 +95,14 @@ impl Devices {
         self.queues[device as usize].run(cost, deadline, work).await
     }
 
+    /// How many sessions were placed and have ended so far, together.
+    pub(crate) fn changes(&self) -> u64 {
+        let placed = self.placed.lock();
+        let current: usize = placed.sessions.iter().sum();
+        // Each that was placed and is not there any more has ended.
+        2 * placed.numbered - current as u64
+    }
+
     /// What each device does, by its place among them.
     pub(crate) fn loads(&self) -> Vec<DeviceLoad> {
         let placed = self.placed.lock().sessions.clone();
@@ -137,7 +145,11 @@ mod tests {
         // Both sessions of device 1 end, and the next two come there.
         slots.retain(|slot| slot.device != 1);
         assert_eq!(sessions(), [3, 0, 2]);
+        let before = devices.changes();
         slots.extend([devices.place(), devices.place()]);
+        slots.pop();
+        assert_eq!(devices.changes() - before, 3, "two began, and one ended");
+        slots.push(devices.place());
         assert_eq!(sessions(), [3, 2, 2]);
         let numbers: std::collections::BTreeSet<u64> =
             slots.iter().map(DeviceSlot::number).collect();

@@ -173,6 +173,14 @@ impl Engine {
         self.turns.overlay(Instant::now() + self.step_timeout).await
     }
 
+    /// Waits for the turn to read and resolve a scenario.
+    ///
+    /// # Errors
+    /// [`SessionError::DeadlineExceeded`].
+    pub(crate) async fn scenario_turn(&self, deadline: Instant) -> Result<Turn, SessionError> {
+        self.turns.scenario(deadline).await
+    }
+
     /// Waits for the turn to read a whole record.
     ///
     /// # Errors
@@ -240,6 +248,11 @@ impl Engine {
     /// Frames that wait for the renderer.
     pub fn queued_frames(&self) -> usize {
         self.device_loads().iter().map(|load| load.queued_frames).sum()
+    }
+
+    /// How many sessions have begun and ended so far, together.
+    pub fn session_changes(&self) -> u64 {
+        self.devices.changes()
     }
 
     /// What each device of the backend does, in their order.

@@ -1,5 +1,5 @@
-//! Turns: how many long simulations run at once, how many records are read whole, and the overlays
-//! of how many rigs are decoded.
+//! Turns: how many long simulations run at once, how many records are read whole, how many
+//! scenarios are resolved, and the overlays of how many rigs are decoded.
 
 use std::sync::Arc;
 use std::thread::available_parallelism;
@@ -22,6 +22,7 @@ pub(crate) struct Turns {
     simulations: Arc<Semaphore>,
     records: Arc<Semaphore>,
     overlays: Arc<Semaphore>,
+    scenarios: Arc<Semaphore>,
 }
 
 impl Turns {
@@ -33,6 +34,7 @@ impl Turns {
             simulations: Arc::new(Semaphore::new((processors / 2).max(1))),
             records: Arc::new(Semaphore::new(limits::RECORDS_AT_ONCE)),
             overlays: Arc::new(Semaphore::new(limits::OVERLAYS_AT_ONCE)),
+            scenarios: Arc::new(Semaphore::new(limits::SCENARIOS_AT_ONCE)),
         }
     }
 
@@ -46,6 +48,12 @@ impl Turns {
     /// [`SessionError::DeadlineExceeded`].
     pub(crate) async fn overlay(&self, deadline: Instant) -> Result<Turn, SessionError> {
         turn(&self.overlays, deadline).await
+    }
+
+    /// # Errors
+    /// [`SessionError::DeadlineExceeded`].
+    pub(crate) async fn scenario(&self, deadline: Instant) -> Result<Turn, SessionError> {
+        turn(&self.scenarios, deadline).await
     }
 
     /// # Errors

@@ -12,11 +12,17 @@ use wildcity_twin::residency::{Cache, ResidencyError, ResidentActor, Viewpoint};
 use wildcity_twin::store::{Catalog, StoredActor};
 
 use super::default_assets::{generated_actors, nearest};
+use crate::engine::answer_budget::BudgetShare;
 
 /// The asset of each actor, by its index; `None` for an actor that is not drawn. Copies share the
 /// assets.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct ActorAssets(Arc<[Option<Arc<ResidentActor>>]>);
+pub(crate) struct ActorAssets {
+    actors: Arc<[Option<Arc<ResidentActor>>]>,
+    /// The share of the budget for answers that their scenario takes, until the last copy is
+    /// dropped.
+    _share: Option<Arc<BudgetShare>>,
+}
 
 /// Data of a frame by which each of its views chooses the levels of detail of actors.
 #[derive(Clone, Copy, Debug)]
@@ -93,12 +99,17 @@ impl ActorAssets {
     ) -> Result<Self, ResidencyError> {
         let assets: Result<Arc<[_]>, _> =
             hashes.map(|hash| hash.map(|hash| cache.actor(hash)).transpose()).collect();
-        Ok(Self(assets?))
+        Ok(Self { actors: assets?, _share: None })
+    }
+
+    /// The same assets, with a share of memory that lives as long as they do.
+    pub(crate) fn with_share(self, share: BudgetShare) -> Self {
+        Self { _share: Some(Arc::new(share)), ..self }
     }
 
     /// Whether no actor is drawn.
     pub(crate) fn is_empty(&self) -> bool {
-        self.0.iter().all(Option::is_none)
+        self.actors.iter().all(Option::is_none)
     }
 
     /// The actors that a frame draws, given the pose of each at the frame's time, and a time before
@@ -115,7 +126,7 @@ impl ActorAssets {
         // By exposure, because most views have the same one.
         let at_start: BTreeMap<i64, Vec<Option<Pose>>> =
             frame.exposures_us.iter().map(|&us| (us, poses_before(us))).collect();
-        let actors = self.0.iter().zip(poses).enumerate();
+        let actors = self.actors.iter().zip(poses).enumerate();
         let placements = actors.filter_map(|(index, (actor, pose))| {
             let world_from_actor = (*pose)?;
             let start_of = |exposure_us: &i64| {

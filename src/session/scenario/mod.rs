@@ -14,7 +14,6 @@ use serde_json::Value;
 
 use wildcity_options::Start;
 use wildcity_sim::scenario::{EgoStart, ScenarioFile};
-use wildcity_twin::residency::Cache;
 use wildcity_twin::store::Version;
 
 pub use assets::StoredAssets;
@@ -25,6 +24,7 @@ pub(crate) use traffic::settle;
 pub use traffic::{EpisodeTraffic, Event, EventKind};
 
 use self::assets::{ActorAssets, GeneratedActors};
+use crate::engine::Engine;
 use crate::error::SessionError;
 
 /// The scenario of an episode, and the assets of its actors.
@@ -59,20 +59,27 @@ impl SessionScenario {
         Ok(Self { scenarios, file, gives_start, generated: Arc::default() })
     }
 
-    /// The scenario of an episode with a seed, and the assets of its actors, in memory.
+    /// The scenario of an episode with a seed, and the assets of its actors, in memory, which counts
+    /// as that of answers.
+    ///
+    /// # Errors
+    /// It cannot be read or resolved, or too little memory is left for it.
     pub(crate) fn for_episode(
         &self,
         seed: u64,
         version: &Version,
-        cache: &Cache,
+        engine: &Engine,
     ) -> Result<EpisodeScenario, SessionError> {
+        let cache = engine.cache();
         let pinned = (&version.manifest, version.hash.as_str());
         let file = self.file.clone();
         let assets = StoredAssets::sharing(cache.catalog(), self.generated.clone());
         // Pinned, never the latest: all episodes of a session play in the same files.
         let loaded = self.scenarios.resolve(file, seed, pinned, false, &assets)?;
+        let share = engine.answer_budget().reserve(loaded.memory_bytes)?;
         let actors = loaded.scenario.traffic.actors.iter();
         let assets = ActorAssets::load(cache, actors.map(|actor| actor.spec.asset.as_deref()))?;
+        let assets = assets.with_share(share);
         Ok(EpisodeScenario { loaded: Arc::new(loaded), assets })
     }
 

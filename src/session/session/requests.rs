@@ -301,8 +301,14 @@ impl Session {
                 let scenario = scenario.clone();
                 let version = self.resident().version.clone();
                 let engine = self.engine.clone();
-                let find = move || scenario.for_episode(seed, &version, engine.cache());
-                Some(run_blocking(find).await??)
+                let deadline = Instant::now() + engine.step_timeout();
+                let turn = engine.scenario_turn(deadline).await?;
+                let find = move |stop: &Stop| {
+                    let _turn = turn;
+                    stop.refusal()?;
+                    scenario.for_episode(seed, &version, &engine)
+                };
+                Some(run_until(deadline, find).await?)
             }
         };
         // The request, then the session's random start, then the scenario. Without any, the
@@ -370,7 +376,11 @@ impl Session {
     /// Ends the session and summarizes its last episode.
     pub async fn close(mut self, outcome: Outcome) -> EpisodeSummary {
         self.end_recording(outcome).await;
-        self.state.episode.summary(outcome)
+        let summary = self.state.episode.summary(outcome);
+        // Millions of small values may be freed, which must not hold up an async thread. Without
+        // waiting: nothing depends on it.
+        tokio::task::spawn_blocking(move || drop(self));
+        summary
     }
 
     /// Renders captures of a version one after the other, each scheduled among the other sessions'
