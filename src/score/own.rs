@@ -230,8 +230,9 @@ fn judgement(record: &DriveRecord, faults: &[FaultAt], not_judged: &[NotJudged])
     }
 }
 
-/// Why contacts may have been missed: within long steps, or by a teleported ego that was put farther
-/// away within a step than the way is swept, and may have passed through an actor or a wall.
+/// Why contacts may have been missed: within long steps, or by a teleported ego that was put
+/// farther away within a step than the way is swept, and may have passed through an actor or a
+/// wall.
 fn untested(record: &DriveRecord) -> Option<&'static str> {
     let most_m = MAX_SWEPT_SPEED_MPS * record.dt_us as f64 * 1e-6;
     let is_far = |pair: &[EgoSample]| pair[0].origin_m.distance(pair[1].origin_m) > most_m;

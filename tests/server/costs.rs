@@ -181,6 +181,36 @@ async fn one_token_leaves_sessions_to_others() {
     greeted_agent(&server, BOB).await.open(json!({ "session": "e" })).await;
 }
 
+/// A scenario takes memory as long as its session, and each snapshot a copy of its state.
+#[tokio::test]
+async fn scenarios_and_snapshots_count() {
+    let server = TestServer::start().await;
+    let counted = || server.running.engine().answer_bytes();
+    let before = counted();
+    let mut agent = server.agent().await;
+    let mut scenario = crowd();
+    // It never fires.
+    let never = json!([{ "when": { "time_s": 99 }, "do": [{ "speed": { "to": 1, "rate": 1 } }] }]);
+    for actor in scenario["actors"].as_array_mut().unwrap() {
+        actor["script"] = never.clone();
+    }
+    let opened = agent.try_open(json!({ "session": "s", "scenario": scenario,
+        "outputs": { "encoding": "raw" } }));
+    assert_eq!(opened.await["type"], "opened");
+    // 3 KiB for each trigger and 8 KiB for each actor.
+    let opened = counted() - before;
+    assert!(opened >= 256 * 11 * 1024, "{opened}");
+    let step = json!({ "type": "step", "action": { "acceleration": 0, "curvature": 0 } });
+    agent.look(step).await;
+    let driven = counted();
+    for name in ["a", "b"] {
+        let snapshot = json!({ "type": "snapshot", "name": name });
+        assert_eq!(agent.ask(snapshot).await["type"], "ok");
+    }
+    let taken = counted() - driven;
+    assert!(taken >= 2 * 256 * 100, "{taken}");
+}
+
 #[tokio::test]
 async fn an_inline_scenario_learns_nothing_of_other_files() {
     let server = TestServer::start().await;

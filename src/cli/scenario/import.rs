@@ -73,7 +73,7 @@ impl Import {
         let context = || format!("{}", self.file.display());
         let bytes = ingest::read_whole(&self.file, openscenario_bytes()).with_context(context)?;
         let settings = openscenario::Settings {
-            name: super::name_of(&self.out)?,
+            name: super::scenario_name(&self.out)?,
             twin: self.twin.clone(),
             ego: self.ego.clone(),
             directory: Some(self.file.parent().unwrap_or(Path::new("")).to_owned()),

@@ -66,7 +66,7 @@ fn opened(path: &Path, catalog: &Catalog) -> anyhow::Result<Opened> {
     let scenarios = Scenarios::in_dir(dir);
     let has_extension = path.extension().is_some_and(|extension| extension == "json");
     anyhow::ensure!(has_extension, "{}: a scenario is a .json file", path.display());
-    let name = name_of(path)?;
+    let name = scenario_name(path)?;
     let document = scenarios.document(&ScenarioSource::Named(name)).with_context(context)?;
     let file = document.with(&document.first_values()).with_context(context)?;
     let found = match &file.twin.version_hash {
@@ -78,7 +78,7 @@ fn opened(path: &Path, catalog: &Catalog) -> anyhow::Result<Opened> {
 }
 
 /// The name of a scenario, which is that of its file.
-fn name_of(path: &Path) -> anyhow::Result<String> {
+fn scenario_name(path: &Path) -> anyhow::Result<String> {
     let stem = path.file_stem().and_then(|stem| stem.to_str()).unwrap_or_default();
     anyhow::ensure!(
         is_name(stem),

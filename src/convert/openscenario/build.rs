@@ -144,7 +144,8 @@ impl Builder<'_, '_> {
         let mut yaw_rad = place.yaw_rad;
         let last = points.len().saturating_sub(1);
         let positions = points.iter().zip(times_s).enumerate().map(|(index, (xyz, time_s))| {
-            // It faces the next point, at the last one as before. One that stands keeps its heading.
+            // It faces the next point, and at the last one as before. One that stands keeps its
+            // heading.
             let next = points[(index + 1).min(last)];
             let way = [next[0] - xyz[0], next[1] - xyz[1]];
             if way[0].hypot(way[1]) > 1e-3 {

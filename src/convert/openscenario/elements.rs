@@ -226,7 +226,8 @@ impl Elements {
             Err(format!("waits for {kind} {name:?}, but there is no entity but the ego to mark it"))
         };
         let key = (kind.to_owned(), name.to_owned());
-        // Of a path only the last name counts, so that two elements of one name cannot be told apart.
+        // Of a path only the last name counts, so that two elements of one name cannot be told
+        // apart.
         if self.counts.get(&key).is_some_and(|count| *count > 1) {
             return Err(format!("{kind} {name:?} is there several times; rename them"));
         }

@@ -59,8 +59,8 @@ impl SessionScenario {
         Ok(Self { scenarios, file, gives_start, generated: Arc::default() })
     }
 
-    /// The scenario of an episode with a seed, and the assets of its actors, in memory, which counts
-    /// as that of answers.
+    /// The scenario of an episode with a seed, and the assets of its actors, in memory, which
+    /// counts as that of answers.
     ///
     /// # Errors
     /// It cannot be read or resolved, or too little memory is left for it.
