@@ -35,6 +35,11 @@ impl Inbox {
         early
     }
 
+    /// Whether a part of a message has arrived, of which the rest has not.
+    pub(crate) fn is_within_message(&mut self) -> bool {
+        self.socket.is_within_message()
+    }
+
     /// Carries out a request, and keeps the messages that are received meanwhile. If a client sends
     /// too many messages ahead, no more are read until the request is done, so that its pings wait
     /// as well.

@@ -62,6 +62,7 @@ mod stream;
 mod tickets;
 mod tls;
 mod token_counts;
+mod unfinished;
 mod watchers;
 
 // The support of the tests names this package.

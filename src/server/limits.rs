@@ -81,6 +81,9 @@ pub const INLINE_REQUEST_BYTES: usize = 16 << 10;
 /// and 48 MiB.
 pub const PARSED_AT_ONCE: usize = 4;
 
+/// Bytes of WebSocket messages that were begun and have not ended, on all connections.
+pub const UNFINISHED_BYTES: u64 = 256 << 20;
+
 /// Messages up to this length are written into shared memory at once, on the thread of the
 /// connection: 256 KiB take about 0.1 ms. Longer ones are written on a thread that may block.
 pub const INLINE_MEMORY_BYTES: u64 = 256 << 10;

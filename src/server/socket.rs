@@ -1,6 +1,7 @@
 //! WebSocket messages, with a time-out on every wait.
 
 use std::io::{self, IoSlice};
+use std::sync::Arc;
 use std::time::Duration;
 
 use futures_util::{SinkExt as _, StreamExt as _};
@@ -15,6 +16,7 @@ use tokio_tungstenite::tungstenite::{Error, Message};
 use crate::fault::{CloseStatus, Fault};
 use crate::limits;
 use crate::stream::Stream;
+use crate::unfinished::Unfinished;
 
 pub(crate) struct Socket {
     stream: WebSocketStream<Stream>,
@@ -49,8 +51,14 @@ pub(crate) enum Disconnect {
 
 impl Socket {
     /// Takes over a connection from HTTP; `read_ahead` has the bytes that HTTP has already read
-    /// from it.
-    pub(crate) async fn new(stream: Stream, read_ahead: Vec<u8>, send_timeout: Duration) -> Self {
+    /// from it. Messages that are not whole yet count among `unfinished`.
+    pub(crate) async fn new(
+        mut stream: Stream,
+        read_ahead: Vec<u8>,
+        send_timeout: Duration,
+        unfinished: Arc<Unfinished>,
+    ) -> Self {
+        stream.count_messages(unfinished);
         let config = WebSocketConfig::default()
             .max_message_size(Some(wildcity_protocol::limits::INBOUND_MESSAGE_BYTES))
             .max_frame_size(Some(wildcity_protocol::limits::INBOUND_MESSAGE_BYTES))
@@ -69,9 +77,21 @@ impl Socket {
         self.stream.get_ref().same_machine()
     }
 
+    /// Whether a part of a message has arrived.
+    pub(crate) fn is_within_message(&mut self) -> bool {
+        self.stream.get_mut().unfinished().is_some_and(|own| own.is_within_message())
+    }
+
     /// Waits for the next message. Dropping the future loses no request.
     pub(crate) async fn receive(&mut self) -> Result<Incoming, Disconnect> {
-        match self.stream.next().await {
+        let received = self.stream.next().await;
+        if let (Some(Ok(message)), Some(own)) = (&received, self.stream.get_mut().unfinished()) {
+            match message {
+                Message::Ping(payload) | Message::Pong(payload) => own.control_frame(payload.len()),
+                _ => own.message_ended(),
+            }
+        }
+        match received {
             Some(Ok(Message::Text(text))) => Ok(Incoming::Text(text.as_str().to_owned())),
             Some(Ok(Message::Binary(_))) => Err(Disconnect::Fault(Fault::UnexpectedBinary)),
             // The pong is sent before more is read: a client that pings and never reads is not
@@ -94,6 +114,10 @@ impl Socket {
                     Disconnect::PeerLeft
                 }
                 Error::Utf8(_) => Disconnect::Fault(Fault::NotUtf8),
+                Error::Io(error) if error.kind() == io::ErrorKind::QuotaExceeded => {
+                    let limit = limits::UNFINISHED_BYTES as usize;
+                    Disconnect::Fault(Fault::Busy { what: "bytes of unfinished messages", limit })
+                }
                 Error::Protocol(_) | Error::Capacity(_) => {
                     Disconnect::Fault(Fault::BrokenFrame(error.to_string()))
                 }
@@ -248,7 +272,8 @@ mod tests {
         // sender gives up.
         let (mut client, server) = tokio::io::duplex(64);
         let stream = Stream::new(server, Err("a test"));
-        let mut socket = Socket::new(stream, Vec::new(), Duration::from_secs(5)).await;
+        let timeout_s = Duration::from_secs(5);
+        let mut socket = Socket::new(stream, Vec::new(), timeout_s, Arc::default()).await;
         let payload = [7; 1000];
         let given_up = timeout(Duration::from_millis(20), socket.send_binary(&[&payload])).await;
         assert!(given_up.is_err(), "it does not fit");

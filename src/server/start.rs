@@ -152,6 +152,7 @@ pub async fn start(config: Config) -> Result<Running, ServerError> {
         engine,
         sessions: SessionRegistry::new(limits.sessions, limits.resume_grace),
         websocket_permits: Arc::new(Semaphore::new(limits.connections)),
+        unfinished: Arc::default(),
         parse_turns: Arc::new(Semaphore::new(crate::limits::PARSED_AT_ONCE)),
         drive_turns: Arc::new(Semaphore::new(crate::limits::DRIVES_AT_ONCE)),
         scenario_listing: Arc::default(),

@@ -20,6 +20,7 @@ use crate::sessions::SessionRegistry;
 use crate::spool::Spool;
 use crate::tickets::Tickets;
 use crate::token_counts::TokenCounts;
+use crate::unfinished::Unfinished;
 
 /// State that all connections of a server share.
 pub(crate) struct ServerState {
@@ -47,6 +48,8 @@ pub(crate) struct ServerState {
     pub(crate) spool: Result<Arc<Spool>, String>,
     pub(crate) pushes: PushQueue,
     pub(crate) metrics: Metrics,
+    /// Bytes of messages that were begun on all WebSockets.
+    pub(crate) unfinished: Arc<Unfinished>,
     /// Turns of messages that are parsed on threads that may block.
     pub(crate) parse_turns: Arc<Semaphore>,
     /// Turns of requests for parts of drives.

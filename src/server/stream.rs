@@ -2,7 +2,8 @@
 
 use std::io::{self, IoSlice};
 use std::pin::Pin;
-use std::task::{Context, Poll};
+use std::sync::Arc;
+use std::task::{Context, Poll, ready};
 use std::time::Duration;
 
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
@@ -10,11 +11,14 @@ use tokio::net::TcpStream;
 use tokio::time::timeout;
 
 use crate::tls::Tls;
+use crate::unfinished::{OwnUnfinished, Unfinished};
 
 /// A connection: the bytes of a socket, of TLS, or of a simulated network.
 pub(crate) struct Stream {
     bytes: Box<dyn ByteStream>,
     same_machine: Result<(), &'static str>,
+    /// What was received of a WebSocket message; `None` while the connection is one of HTTP.
+    unfinished: Option<OwnUnfinished>,
 }
 
 /// Bytes in both directions.
@@ -29,7 +33,7 @@ impl Stream {
         bytes: impl ByteStream + 'static,
         same_machine: Result<(), &'static str>,
     ) -> Self {
-        Self { bytes: Box::new(bytes), same_machine }
+        Self { bytes: Box::new(bytes), same_machine, unfinished: None }
     }
 
     /// The stream of a new connection; none if its handshake of TLS fails or takes too long.
@@ -57,6 +61,16 @@ impl Stream {
         }
     }
 
+    /// Counts what is received from now on as that of WebSocket messages.
+    pub(crate) fn count_messages(&mut self, all: Arc<Unfinished>) {
+        self.unfinished = Some(OwnUnfinished::new(all));
+    }
+
+    /// What was received of a message that has not ended.
+    pub(crate) fn unfinished(&mut self) -> Option<&mut OwnUnfinished> {
+        self.unfinished.as_mut()
+    }
+
     /// Whether the other end is on this machine. An error has the reason if it is not, or if this
     /// is unknown.
     pub(crate) fn same_machine(&self) -> Result<(), &'static str> {
@@ -70,7 +84,11 @@ impl AsyncRead for Stream {
         cx: &mut Context<'_>,
         buffer: &mut ReadBuf<'_>,
     ) -> Poll<io::Result<()>> {
-        Pin::new(&mut self.bytes).poll_read(cx, buffer)
+        let before = buffer.filled().len();
+        ready!(Pin::new(&mut self.bytes).poll_read(cx, buffer))?;
+        let received = buffer.filled().len() - before;
+        let counted = self.unfinished.as_mut().map(|unfinished| unfinished.received(received));
+        Poll::Ready(counted.unwrap_or(Ok(())))
     }
 }
 

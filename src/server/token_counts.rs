@@ -99,7 +99,8 @@ mod tests {
         let _own: Vec<Counted> = (0..6).map(|_| connections.connection(&a, 8).unwrap()).collect();
         assert!(matches!(connections.connection(&a, 8), Err(Fault::Busy { limit: 6, .. })));
         assert!(connections.connection(&b, 8).is_ok());
-        let anyone = Grant { name: String::new(), ..(*a).clone() };
+        let mut anyone = (*a).clone();
+        anyone.name.clear();
         let _all: Vec<Counted> =
             (0..8).map(|_| connections.connection(&anyone, 8).unwrap()).collect();
     }

@@ -151,9 +151,10 @@ impl Connection {
             let fault = tokio::select! {
                 incoming = inbox.next() => match incoming? {
                     Incoming::Text(text) => return Ok(text),
-                    // A client that computes for long sends pings to stay.
+                    // A client that computes for long sends pings to stay. One that has begun a
+                    // request has to end it.
                     Incoming::Alive => {
-                        if self.hello_done {
+                        if self.hello_done && !inbox.is_within_message() {
                             deadline = Instant::now() + idle;
                         }
                         continue;

@@ -117,12 +117,13 @@ where
     // This completes after the answer below was sent, so it is awaited in another task.
     let upgrade = hyper::upgrade::on(&mut request);
     let send_timeout = state.limits.send;
+    let unfinished = state.unfinished.clone();
     state.engine.polls().spawn("WebSocket", async move {
         // Held until the connection ends.
         let _slots = slots;
         match upgrade.await.map(into_stream) {
             Ok(Ok((stream, read_ahead))) => {
-                serve(Socket::new(stream, read_ahead, send_timeout).await).await;
+                serve(Socket::new(stream, read_ahead, send_timeout, unfinished).await).await;
             }
             Ok(Err(_)) => tracing::error!("a WebSocket upgrade did not give back its socket"),
             Err(error) => tracing::debug!("a client left during its upgrade: {error}"),
