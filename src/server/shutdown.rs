@@ -96,12 +96,17 @@ async fn release_memory(state: &ServerState) {
         (state.engine.residency().evictions, state.pushes.changes(), sessions)
     };
     let mut before = changes();
+    // The last change may be counted while its memory is being freed, so that one more release
+    // follows.
+    let mut is_due = false;
     loop {
         tokio::time::sleep(state.limits.memory_release).await;
         let now = changes();
-        if now == before && state.pushes.open_count() == 0 {
+        let has_changed = now != before || state.pushes.open_count() > 0;
+        if !has_changed && !is_due {
             continue;
         }
+        is_due = has_changed;
         before = now;
         let began = Instant::now();
         match tokio::task::spawn_blocking(wildcity_heap::release_free_memory).await {

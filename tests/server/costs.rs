@@ -190,13 +190,13 @@ async fn scenarios_and_snapshots_count() {
     let mut agent = server.agent().await;
     let mut scenario = crowd();
     // It never fires.
-    let never = json!([{ "when": { "time_s": 99 }, "do": [{ "speed": { "to": 1, "rate": 1 } }] }]);
+    let never = json!([{ "when": { "time_s": 99 }, "do": [{ "remove": {} }] }]);
     for actor in scenario["actors"].as_array_mut().unwrap() {
         actor["script"] = never.clone();
     }
-    let opened = agent.try_open(json!({ "session": "s", "scenario": scenario,
-        "outputs": { "encoding": "raw" } }));
-    assert_eq!(opened.await["type"], "opened");
+    let asked = json!({ "session": "s", "scenario": scenario, "outputs": { "encoding": "raw" } });
+    let opened = agent.try_open(asked).await;
+    assert_eq!(opened["type"], "opened", "{opened}");
     // 3 KiB for each trigger and 8 KiB for each actor.
     let opened = counted() - before;
     assert!(opened >= 256 * 11 * 1024, "{opened}");
