@@ -377,8 +377,9 @@ impl Session {
     pub async fn close(mut self, outcome: Outcome) -> EpisodeSummary {
         self.end_recording(outcome).await;
         let summary = self.state.episode.summary(outcome);
-        // Millions of small values may be freed, which must not hold up an async thread. It is waited
-        // for, so that the next session has the memory of this one; a panic would only lose that.
+        // Millions of small values may be freed, which must not hold up an async thread. It is
+        // waited for, so that the next session has the memory of this one; a panic would only lose
+        // that.
         let _ = run_blocking(move || drop(self)).await;
         summary
     }
