@@ -78,7 +78,6 @@ pub struct Options {
     pub lenses: bool,
     /// Largest number of points of the COLMAP model, and the seed of their choice.
     pub points: u32,
-    /// Seed of the choice of `points`.
     pub seed: u64,
     /// Form of the COLMAP model: `txt` or `bin`.
     pub colmap: String,

@@ -1,9 +1,9 @@
 //! Options that choose the backend and the hardware that it runs on.
 
 use std::io::{self, Write};
-#[cfg(feature = "gpu")]
-use std::num::NonZero;
 use std::sync::Arc;
+#[cfg(feature = "gpu")]
+use std::{collections::BTreeSet, num::NonZero};
 
 #[cfg(feature = "gpu")]
 use anyhow::Context as _;
@@ -223,6 +223,10 @@ impl HardwareOptions {
     /// Creates a gpu backend on each of several devices, which share the render threads.
     #[cfg(feature = "gpu")]
     fn gpus(&self, devices: &[usize]) -> anyhow::Result<Arc<dyn Backend>> {
+        let mut numbers = BTreeSet::new();
+        if let Some(twice) = devices.iter().find(|number| !numbers.insert(**number)) {
+            anyhow::bail!("--devices: {twice} is named twice; its memory would hold all twice");
+        }
         let cores = std::thread::available_parallelism().map_or(1, NonZero::get);
         let threads = if self.threads == 0 { cores } else { self.threads };
         let gpu = |number: &usize| {

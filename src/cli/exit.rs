@@ -48,7 +48,6 @@ pub fn code(result: anyhow::Result<()>) -> ExitCode {
 /// twice: the `Display` text of many errors includes that of their source.
 pub fn chain(error: &anyhow::Error) -> String {
     error.chain().map(ToString::to_string).fold(String::new(), |text, cause| {
-        // Some errors repeat their cause in their own text.
         match (text.is_empty(), text.ends_with(&cause)) {
             (true, _) => cause,
             (false, true) => text,

@@ -47,7 +47,6 @@ const MOVED: f64 = 0.014;
 /// Largest change of a colour (1 is white) from the plane to its normal; the smallest is
 /// [`TINT_LEAST`] of it.
 const TINT: f64 = 4.0;
-/// Smallest change of a colour, as a share of the largest one, [`TINT`].
 const TINT_LEAST: f64 = 0.4;
 /// Share of the change that is equal in all three channels; the rest is drawn for each channel.
 const TINT_GREY: f64 = 0.8;
@@ -56,7 +55,6 @@ const TINT_PATCH: f64 = 0.9;
 /// Share of the Gaussians that are needles along the ray, up to [`NEEDLE_LENGTH`] times as long as
 /// they were wide.
 const NEEDLES: f64 = 0.05;
-/// Length of the longest needle, in widths of the Gaussian that it is made of.
 const NEEDLE_LENGTH: f64 = 4.0;
 /// Number of floating sheets per Gaussian.
 const SHEETS: f64 = 0.06;

@@ -108,8 +108,8 @@ fn write(log: &Log, out: &Path, settings: &SplitSettings) -> Result<Split, LogEr
     let stations = Stations::new(&poses);
     let mut splitter = Splitter::new(log, &poses, &stations, settings)?;
     let drives = write_drives(log, &poses, out, settings)?;
-    // The last one has the rest of the drive, and the rows after the last pose. A rest of less than
-    // a millimetre is rounding.
+    // The last chunk has the rest of the drive, and the rows after the last pose. A rest of less
+    // than a millimetre is rounding.
     let length_m = (stations.length_m() - 1e-3).max(0.0);
     let count = (length_m / settings.chunk_m).floor() as usize + 1;
     let mut chunks = Vec::new();

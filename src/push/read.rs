@@ -104,6 +104,7 @@ pub(crate) fn read(
         if !is_first {
             reader.drop_parts();
             reader.joins_at_once = true;
+            reader.join_first()?;
         }
         for (index, requested) in requested.iter().enumerate() {
             if names_others[index] == is_first && !reader.parts.contains(&files[index].name) {
@@ -251,10 +252,19 @@ impl<'a> Reader<'a> {
         self.parts.extend(read.parts.iter().cloned());
         self.read.insert(index, read);
         // Joining at once keeps one scene in memory beside the joined one, and not all of them.
-        if self.joins_at_once && index == self.next {
-            self.join_read(index + 1)?;
+        if self.joins_at_once {
+            self.join_first()?;
         }
         Ok(())
+    }
+
+    /// Joins the scenes before the first one that is not read yet.
+    fn join_first(&mut self) -> Result<(), PushError> {
+        let is_missing = |index: &usize| {
+            !self.read.contains_key(index) && !self.parts.contains(&self.files[*index].name)
+        };
+        let missing = (self.next..self.files.len()).find(is_missing);
+        self.join_read(missing.unwrap_or(self.files.len()))
     }
 
     /// Drops the scenes that were read of files that are parts of others.

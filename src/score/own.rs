@@ -24,9 +24,9 @@ pub const LEAST_PROGRESS: f64 = 0.8;
 /// by metres in several; the road is looked at at the ends only.
 pub const MOST_STEP_US: i64 = 500_000;
 
-/// Why contacts are not judged after a jump.
+/// Why the absence of contacts is not judged after a jump; a contact that was found counts.
 const JUMPS: &str = "the ego jumped faster than 60 m/s, and what was on its way was not tested";
-/// Why nothing that an ego meets is judged in long steps.
+/// Why the absence of faults is not judged in long steps; a fault that was found counts.
 const LONG_STEPS: &str = "what is on the way within a step of more than 0.5 s was not tested";
 
 /// Progress is not measured along a recording that moves less than this, in metres.

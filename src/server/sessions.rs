@@ -280,13 +280,14 @@ impl SessionRegistry {
         }
         // Clients can open and close as often as they like, so the map has a bound.
         if closed.len() >= self.limit {
-            // Of the token that has the most, so that none loses its answers to others.
+            // Of the token that has the most, so that a token with few loses none to one with many.
             let mut counts: BTreeMap<&str, usize> = BTreeMap::new();
             for session in closed.values() {
                 *counts.entry(&session.owner).or_default() += 1;
             }
-            let most = counts.into_iter().max_by_key(|(_, count)| *count).map(|(owner, _)| owner);
-            let of_most = closed.iter().filter(|(_, session)| most == Some(&*session.owner));
+            let most = counts.values().max().copied();
+            let of_most =
+                closed.iter().filter(|(_, session)| counts.get(&*session.owner).copied() == most);
             let oldest = of_most.min_by_key(|(_, session)| session.since);
             if let Some(name) = oldest.map(|(name, _)| name.clone()) {
                 closed.remove(&name);

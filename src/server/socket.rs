@@ -1,7 +1,6 @@
 //! WebSocket messages, with a time-out on every wait.
 
 use std::io::{self, IoSlice};
-use std::sync::Arc;
 use std::time::Duration;
 
 use futures_util::{SinkExt as _, StreamExt as _};
@@ -16,7 +15,7 @@ use tokio_tungstenite::tungstenite::{Error, Message};
 use crate::fault::{CloseStatus, Fault};
 use crate::limits;
 use crate::stream::Stream;
-use crate::unfinished::Unfinished;
+use crate::unfinished::OwnUnfinished;
 
 pub(crate) struct Socket {
     stream: WebSocketStream<Stream>,
@@ -56,7 +55,7 @@ impl Socket {
         mut stream: Stream,
         read_ahead: Vec<u8>,
         send_timeout: Duration,
-        unfinished: Arc<Unfinished>,
+        unfinished: OwnUnfinished,
     ) -> Self {
         stream.count_messages(unfinished);
         let config = WebSocketConfig::default()
@@ -115,8 +114,7 @@ impl Socket {
                 }
                 Error::Utf8(_) => Disconnect::Fault(Fault::NotUtf8),
                 Error::Io(error) if error.kind() == io::ErrorKind::QuotaExceeded => {
-                    let limit = limits::UNFINISHED_BYTES as usize;
-                    Disconnect::Fault(Fault::Busy { what: "bytes of unfinished messages", limit })
+                    Disconnect::Fault(Fault::Unfinished)
                 }
                 Error::Protocol(_) | Error::Capacity(_) => {
                     Disconnect::Fault(Fault::BrokenFrame(error.to_string()))
@@ -199,6 +197,7 @@ impl Socket {
     /// Reads to the client's Close frame, which may have come before the connection ended. Nothing
     /// is read while something is sent.
     async fn read_close(&mut self) {
+        self.stream.get_mut().stop_counting();
         let read = async {
             while let Some(Ok(message)) = self.stream.next().await {
                 if let Message::Close(frame) = message {
@@ -225,6 +224,7 @@ impl Socket {
                 let _ = self.send(FINAL_CLOSE, &[&payload]).await;
             }
             let mut stream = self.stream.into_inner();
+            stream.stop_counting();
             // The client reads the end of the stream after the last message, while its own bytes
             // are still read.
             stream.shutdown().await?;
@@ -273,7 +273,8 @@ mod tests {
         let (mut client, server) = tokio::io::duplex(64);
         let stream = Stream::new(server, Err("a test"));
         let timeout_s = Duration::from_secs(5);
-        let mut socket = Socket::new(stream, Vec::new(), timeout_s, Arc::default()).await;
+        let unfinished = OwnUnfinished::new(Default::default(), String::new());
+        let mut socket = Socket::new(stream, Vec::new(), timeout_s, unfinished).await;
         let payload = [7; 1000];
         let given_up = timeout(Duration::from_millis(20), socket.send_binary(&[&payload])).await;
         assert!(given_up.is_err(), "it does not fit");

@@ -2,7 +2,6 @@
 
 use std::io::{self, IoSlice};
 use std::pin::Pin;
-use std::sync::Arc;
 use std::task::{Context, Poll, ready};
 use std::time::Duration;
 
@@ -11,7 +10,7 @@ use tokio::net::TcpStream;
 use tokio::time::timeout;
 
 use crate::tls::Tls;
-use crate::unfinished::{OwnUnfinished, Unfinished};
+use crate::unfinished::OwnUnfinished;
 
 /// A connection: the bytes of a socket, of TLS, or of a simulated network.
 pub(crate) struct Stream {
@@ -62,8 +61,13 @@ impl Stream {
     }
 
     /// Counts what is received from now on as that of WebSocket messages.
-    pub(crate) fn count_messages(&mut self, all: Arc<Unfinished>) {
-        self.unfinished = Some(OwnUnfinished::new(all));
+    pub(crate) fn count_messages(&mut self, unfinished: OwnUnfinished) {
+        self.unfinished = Some(unfinished);
+    }
+
+    /// Counts nothing any more: what is received is discarded.
+    pub(crate) fn stop_counting(&mut self) {
+        self.unfinished = None;
     }
 
     /// What was received of a message that has not ended.

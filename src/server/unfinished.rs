@@ -1,20 +1,30 @@
 //! Bytes of WebSocket messages that were begun and have not ended: a client may begin one on each
 //! of its connections, and never end it.
 
+use std::collections::BTreeMap;
 use std::io;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+
+use parking_lot::Mutex;
 
 use crate::limits;
 
 /// Bytes of the unfinished messages of all connections.
 #[derive(Debug, Default)]
-pub(crate) struct Unfinished(AtomicU64);
+pub(crate) struct Unfinished(Mutex<Sums>);
+
+#[derive(Debug, Default)]
+struct Sums {
+    all: u64,
+    /// By token, those that have some.
+    tokens: BTreeMap<String, u64>,
+}
 
 /// Bytes of the unfinished message of one connection.
 #[derive(Debug)]
 pub(crate) struct OwnUnfinished {
     all: Arc<Unfinished>,
+    token: String,
     own: u64,
 }
 
@@ -22,20 +32,34 @@ pub(crate) struct OwnUnfinished {
 const CONTROL_FRAME: u64 = 6;
 
 impl OwnUnfinished {
-    pub(crate) fn new(all: Arc<Unfinished>) -> Self {
-        Self { all, own: 0 }
+    /// Of a connection of a token, whose name is empty on a server without tokens.
+    pub(crate) fn new(all: Arc<Unfinished>, token: String) -> Self {
+        Self { all, token, own: 0 }
     }
 
     /// Counts bytes that arrived.
     ///
     /// # Errors
-    /// All connections together have begun too much, and this one more than a request usually has.
+    /// All connections together, or those of the token, have begun too much, and this one more than
+    /// a request usually has.
     pub(crate) fn received(&mut self, bytes: usize) -> io::Result<()> {
-        self.own += bytes as u64;
-        // Only the sum counts, and no other memory depends on it.
-        let all = self.all.0.fetch_add(bytes as u64, Relaxed) + bytes as u64;
-        let is_long = self.own > limits::INLINE_REQUEST_BYTES as u64;
-        if is_long && all > limits::UNFINISHED_BYTES {
+        let bytes = bytes as u64;
+        self.own += bytes;
+        let mut sums = self.all.0.lock();
+        sums.all += bytes;
+        // Without a copy of the name, but for the first bytes.
+        if !sums.tokens.contains_key(&self.token) {
+            sums.tokens.insert(self.token.clone(), 0);
+        }
+        let of_token = sums.tokens.get_mut(&self.token).map_or(bytes, |of_token| {
+            *of_token += bytes;
+            *of_token
+        });
+        // A token leaves some to others; without tokens there are none.
+        let left = if self.token.is_empty() { 0 } else { limits::UNFINISHED_BYTES / 4 };
+        let is_over =
+            of_token > limits::UNFINISHED_BYTES - left || sums.all > limits::UNFINISHED_BYTES;
+        if is_over && self.own > limits::INLINE_REQUEST_BYTES as u64 {
             return Err(io::Error::from(io::ErrorKind::QuotaExceeded));
         }
         Ok(())
@@ -60,7 +84,15 @@ impl OwnUnfinished {
         // The bytes of a frame that HTTP had read ahead were never counted.
         let freed = bytes.min(self.own);
         self.own -= freed;
-        self.all.0.fetch_sub(freed, Relaxed);
+        let mut sums = self.all.0.lock();
+        sums.all -= freed;
+        if let Some(token) = sums.tokens.get_mut(&self.token) {
+            *token -= freed;
+            // Names of tokens that have nothing do not stay.
+            if *token == 0 {
+                sums.tokens.remove(&self.token);
+            }
+        }
     }
 }
 
@@ -77,10 +109,11 @@ mod tests {
     #[test]
     fn what_was_begun_counts_until_it_ends_or_its_connection_does() {
         let all = Arc::new(Unfinished::default());
+        let of = |token: &str| OwnUnfinished::new(all.clone(), token.to_owned());
         let most = limits::UNFINISHED_BYTES as usize;
-        let mut long = OwnUnfinished::new(all.clone());
+        let mut long = of("");
         long.received(most).unwrap();
-        let mut next = OwnUnfinished::new(all.clone());
+        let mut next = of("");
         // Short requests are still received, and a long one is not.
         next.received(limits::INLINE_REQUEST_BYTES).unwrap();
         let refused = next.received(1).unwrap_err();
@@ -90,9 +123,14 @@ mod tests {
         // A ping within a message is no part of it.
         long.received(CONTROL_FRAME as usize + 3).unwrap_err();
         long.control_frame(3);
-        assert_eq!(all.0.load(Relaxed), limits::UNFINISHED_BYTES);
+        assert_eq!(all.0.lock().all, limits::UNFINISHED_BYTES);
         drop(long);
-        assert_eq!(all.0.load(Relaxed), 0);
-        next.received(most).unwrap();
+        assert_eq!(all.0.lock().all, 0);
+        assert!(all.0.lock().tokens.is_empty());
+        // A token leaves a quarter to others.
+        let mut ann = of("ann");
+        ann.received(most / 4 * 3).unwrap();
+        ann.received(1).unwrap_err();
+        of("bob").received(most / 5).unwrap();
     }
 }

@@ -96,8 +96,9 @@ pub const SHORT_WORK: u64 = 2_570;
 /// second of a processor.
 pub const OVERLAYS_AT_ONCE: usize = 2;
 
-/// Scenarios that are read and resolved at once: one of 1 MiB takes 80 MB and 0.1 s, and one with a
-/// map of 16 MiB 115 MB and 0.5 s.
+/// Scenarios that are read and resolved at once on a machine of few processors; on others half of
+/// them: one of 1 MiB takes 80 MB and 0.1 s, and one with a
+/// map of 16 MiB 115 MiB and 0.5 s.
 pub const SCENARIOS_AT_ONCE: usize = 2;
 
 /// Records that are read whole at once, for branches and results: each takes several times the size

@@ -132,7 +132,7 @@ impl EpisodeState {
         Self { episode, frame_history, traffic: None, events: Vec::new() }
     }
 
-    /// Bytes that a copy does not share with its original, in addition to its frames.
+    /// Bytes that a copy does not share with its original. It shares the frames.
     pub(crate) fn copied_bytes(&self) -> u64 {
         let traffic = self.traffic.as_ref().map_or(0, EpisodeTraffic::copied_bytes);
         (traffic + size_of_val(&*self.events)) as u64

@@ -95,7 +95,7 @@ fn t7(run: &mut CaseRun<'_>) -> Result<(), RenderError> {
                 ..GaussianSpec::default()
             });
         }
-        // Row 50 of an image of 200 px width is its middle. Column 100 is straight ahead, and a
+        // Row 50 is the middle of an image of 200 x 100 px. Column 100 is straight ahead, and a
         // slope of 1 is 100 px.
         centers.push((x, 200 * 50 + (slope * 100.0 + 100.0) as usize));
     }

@@ -209,6 +209,8 @@ async fn scenarios_and_snapshots_count() {
     }
     let taken = counted() - driven;
     assert!(taken >= 2 * 256 * 100, "{taken}");
+    agent.ask(json!({ "type": "close" })).await;
+    assert_eq!(counted(), before, "all of it is free");
 }
 
 #[tokio::test]

@@ -66,7 +66,8 @@ inbound!(NewActor, "new_actor");
 pub struct Refused {
     /// The message's `seq`, if it has exactly one and it is a number.
     pub seq: Option<u64>,
-    /// The first mistake of the message, in the order of its text.
+    /// The first mistake of the message, in the order of its text. A wrong tag comes before the
+    /// other fields of its object, and a missing field after them.
     pub mistake: Mistake,
 }
 

@@ -142,7 +142,6 @@ impl Sensorsim {
         Ok(wire::AvailableEgoMasksReturn { ego_mask_metadata })
     }
 
-    /// One image of one camera, as a batch of one.
     pub(super) async fn render_rgb(
         &self,
         asked: wire::RgbRenderRequest,

@@ -93,6 +93,12 @@ fn read(path: &Path) -> anyhow::Result<Vec<OsString>> {
             Value::Integer(number) => number.to_string(),
             Value::Float(number) => number.to_string(),
             Value::Boolean(value) => value.to_string(),
+            Value::Array(values)
+                if option.get_value_delimiter().is_some()
+                    && values.iter().all(Value::is_integer) =>
+            {
+                values.iter().map(Value::to_string).collect::<Vec<_>>().join(",")
+            }
             other => {
                 anyhow::bail!("{key} is of type {}; expected a text or a number", other.type_str())
             }
@@ -186,11 +192,15 @@ impl Resolved {
 
     /// The text of an option that is in effect: given, or a default.
     fn value(&self, id: &str) -> anyhow::Result<Option<String>> {
-        let given = self
-            .matches
-            .get_raw(id)
-            .and_then(|mut values| values.next_back())
-            .map(|value| value.to_string_lossy().into_owned());
+        let texts = self.matches.get_raw(id).map(|values| {
+            values.map(|value| value.to_string_lossy().into_owned()).collect::<Vec<_>>()
+        });
+        let is_list =
+            |option: &Arg| option.get_id() == id && option.get_value_delimiter().is_some();
+        // Of an option with one value the last one counts; a list is one text.
+        let given = texts.and_then(|mut texts| {
+            if command().get_arguments().any(is_list) { Some(texts.join(",")) } else { texts.pop() }
+        });
         match given {
             Some(given) => Ok(Some(given)),
             None => self.serve.default_value(id),
@@ -300,6 +310,10 @@ mod tests {
         assert_eq!(table["audit_log"].as_str(), Some("1e3"), "a file, and no number");
         let second = resolve_with(&first, &[]).unwrap().to_toml().unwrap();
         assert_eq!(first, second);
+        let several = resolve_with("", &["--devices=0,1"]).unwrap().to_toml().unwrap();
+        assert!(several.contains("\ndevices = \"0,1\"\n"), "{several}");
+        assert_eq!(resolve_with(&several, &[]).unwrap().to_toml().unwrap(), several);
+        assert_eq!(resolve_with("devices = [0, 1]", &[]).unwrap().to_toml().unwrap(), several);
     }
 
     #[test]

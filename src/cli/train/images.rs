@@ -254,7 +254,7 @@ fn read_mask(file: &Path, size_px: [u32; 2]) -> anyhow::Result<Vec<bool>> {
 /// A mask or a depth at a smaller size: a pixel has the value of the one at its middle.
 pub(super) fn shrink<T: Copy>(values: &[T], own_px: [u32; 2], small_px: [u32; 2]) -> Vec<T> {
     let at = |axis: usize, px: u32| {
-        // The pixel at the middle of the small one: a mask and a depth have no values in between.
+        // A mask and a depth have no values in between.
         ((f64::from(px) + 0.5) * f64::from(own_px[axis]) / f64::from(small_px[axis])) as usize
     };
     let row = |y: u32| &values[at(1, y) * own_px[0] as usize..][..own_px[0] as usize];

@@ -96,7 +96,7 @@ fn places(version: &Version) -> Vec<Pose> {
 /// Indices of at most this many of `count` things, evenly from the first to the last one.
 fn spread(count: usize, most: usize) -> impl Iterator<Item = usize> {
     let chosen = count.min(most);
-    // From the first to the last. Of none the closure is never called, so that nothing underflows.
+    // For no things the closure is never called, so that nothing underflows.
     (0..chosen).map(move |at| at * (count - 1) / (chosen - 1).max(1))
 }
 

@@ -151,7 +151,8 @@ fn adapters() -> Vec<Adapter> {
     let infos: Vec<AdapterInfo> = found.iter().map(Adapter::get_info).collect();
     let mut index = 0..;
     found.retain(|_| index.next().is_none_or(|index| !is_listed_twice(&infos, index)));
-    // Stable: devices of one kind keep the driver's order, by which `AdapterChoice::Named` counts.
+    // Stable: devices of one kind keep the driver's order. `AdapterChoice::Named` is a place in
+    // this list.
     found.sort_by_key(|adapter| match adapter.get_info().device_type {
         DeviceType::DiscreteGpu => 0,
         DeviceType::IntegratedGpu => 1,
@@ -162,9 +163,8 @@ fn adapters() -> Vec<Adapter> {
     found
 }
 
-/// Whether a device of Vulkan is also one of the system's own interface, which is preferred: with
-/// the driver of macOS and Windows, Vulkan is a layer upon that, or beside it. Devices of one
-/// interface that have the same name are several cards.
+/// Whether a device of Vulkan is also listed by the system's own interface (Metal or DX12), which
+/// is preferred. Devices of one interface that have the same name are several cards.
 fn is_listed_twice(infos: &[AdapterInfo], index: usize) -> bool {
     let AdapterInfo { backend, name, .. } = &infos[index];
     let is_own = |info: &AdapterInfo| info.backend != Backend::Vulkan && info.name == *name;
@@ -184,9 +184,12 @@ impl AdapterChoice {
             Self::Named(choice) => {
                 let name = choice.to_lowercase();
                 let has_name = |info: &AdapterInfo| info.name.to_lowercase().contains(&name);
-                // A number that no device has may be a part of a name, such as 4090.
-                let number = choice.parse().ok().filter(|number| *number < found.len());
-                number.or_else(|| infos.iter().position(has_name))
+                match choice.parse::<usize>() {
+                    // A number that no device has is an error, even if it is a part of a device's
+                    // name: with one card less, another one would be used in silence.
+                    Ok(number) => (number < found.len()).then_some(number),
+                    Err(_) => infos.iter().position(has_name),
+                }
             }
         };
         match (index.and_then(|index| found.into_iter().nth(index)), self) {

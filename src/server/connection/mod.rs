@@ -332,17 +332,19 @@ impl Connection {
             Command::Close => {
                 let slot = self.slot(named)?;
                 // The name is free before the record is complete, which may take a while.
-                let session = self.slots[slot].session.take().ok_or(NO_SESSION)?;
+                let mut session = self.slots[slot].session.take().ok_or(NO_SESSION)?;
                 // Dropping the slot frees the name.
                 drop(self.slots.remove(slot));
                 let name = session.name().to_owned();
                 tracing::info!(session = name, "closed");
                 let episode = session.episode_name();
-                let summary = session.close(Outcome::Completed).await;
+                let summary = session.end(Outcome::Completed).await;
                 let answer = Answer::Text(convert::closed(seq, &summary, episode)?.into());
                 let last = AnsweredRequest { seq, answer: answer.clone() };
                 let owner = &self.grant.name;
                 self.state.sessions.remember_closed(name, owner, last, &summary);
+                // Only now: a client that lost its connection meanwhile finds the answer.
+                session.free().await;
                 Ok(answer)
             }
         }

@@ -35,6 +35,8 @@ pub(crate) enum Fault {
     UnexpectedBinary,
     /// A message has more bytes than a request may have.
     MessageTooLarge { bytes: usize, limit: usize },
+    /// The messages that clients have begun and not ended have too many bytes together.
+    Unfinished,
     /// The bytes are not WebSocket.
     BrokenFrame(String),
     /// A text message, or the reason of a Close frame, is not UTF-8.
@@ -175,6 +177,10 @@ impl Fault {
             Self::MessageTooLarge { bytes, limit } => plain(
                 Code::MessageTooLarge,
                 format!("a message of {bytes} bytes; at most {limit} are accepted"),
+            ),
+            Self::Unfinished => plain(
+                Code::Busy,
+                "clients have begun too many long messages: try again when those have ended",
             ),
             Self::BrokenFrame(cause) => {
                 plain(Code::MalformedJson, format!("not WebSocket: {cause}"))
@@ -418,9 +424,10 @@ impl Fault {
     pub(crate) fn is_fatal(&self) -> bool {
         matches!(
             self,
-            // After the first three the position in the stream of bytes is unknown, so that no
+            // After the first four the position in the stream of bytes is unknown, so that no
             // further message can be read. After the others the connection has no use.
             Self::MessageTooLarge { .. }
+                | Self::Unfinished
                 | Self::BrokenFrame(_)
                 | Self::NotUtf8
                 | Self::TimedOut(_)
@@ -437,7 +444,7 @@ impl Fault {
             Self::BrokenFrame(_) => 1002,
             Self::NotUtf8 => 1007,
             Self::MessageTooLarge { .. } => 1009,
-            Self::Busy { .. } => 1013,
+            Self::Busy { .. } | Self::Unfinished => 1013,
             Self::Internal(_) => 1011,
             // Another connection has the session, or the client was silent: the policy of this
             // server.

@@ -86,7 +86,7 @@ pub(super) async fn trajectory(
         let _turn = turn;
         let version = state.engine.catalog().version(&twin, version).map_err(Fault::from)?;
         let json = convert::drive_body(&version, &section)?;
-        // As long as the client has not taken it.
+        // Counted until the client has taken the answer.
         let share = state.engine.reserve_answer_bytes(json.len() as u64).map_err(Fault::from)?;
         Ok::<_, Fault>(counted(json, share))
     });

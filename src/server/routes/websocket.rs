@@ -20,6 +20,7 @@ use crate::socket::Socket;
 use crate::state::ServerState;
 use crate::stream::Stream;
 use crate::token_counts::Counted;
+use crate::unfinished::OwnUnfinished;
 use crate::watchers;
 
 use super::refusal::HttpResult;
@@ -77,6 +78,8 @@ pub(super) fn subprotocol(route: &str) -> Option<&'static str> {
 
 /// Counters that include a WebSocket connection until it is dropped.
 struct Slots {
+    /// The name of the client's token.
+    token: String,
     _connection: Arc<ConnectionSlot>,
     _of_server: OwnedSemaphorePermit,
     _of_token: Counted,
@@ -98,7 +101,12 @@ impl Slots {
             .clone()
             .try_acquire_owned()
             .map_err(|_| Fault::Busy { what: "connections", limit })?;
-        Ok(Self { _connection: connection, _of_server: of_server, _of_token: of_token })
+        Ok(Self {
+            token: grant.name.clone(),
+            _connection: connection,
+            _of_server: of_server,
+            _of_token: of_token,
+        })
     }
 }
 
@@ -117,7 +125,7 @@ where
     // This completes after the answer below was sent, so it is awaited in another task.
     let upgrade = hyper::upgrade::on(&mut request);
     let send_timeout = state.limits.send;
-    let unfinished = state.unfinished.clone();
+    let unfinished = OwnUnfinished::new(state.unfinished.clone(), slots.token.clone());
     state.engine.polls().spawn("WebSocket", async move {
         // Held until the connection ends.
         let _slots = slots;

@@ -64,6 +64,11 @@ impl Devices {
         Ok(Self { backend, queues, placed: Arc::new(Mutex::new(placed)) })
     }
 
+    /// How many devices there are: as many frames are drawn at once.
+    pub(crate) fn count(&self) -> usize {
+        self.queues.len()
+    }
+
     /// All devices as one backend.
     pub(crate) fn backend(&self) -> &dyn Backend {
         &*self.backend
@@ -95,11 +100,11 @@ impl Devices {
         self.queues[device as usize].run(cost, deadline, work).await
     }
 
-    /// How many sessions were placed and have ended so far, together.
+    /// A number that rises by 1 with each session that is placed, and with each that ends.
     pub(crate) fn changes(&self) -> u64 {
         let placed = self.placed.lock();
         let current: usize = placed.sessions.iter().sum();
-        // Each that was placed and is not there any more has ended.
+        // Placed plus ended, since each that is not there any more has ended, plus a constant 2.
         2 * placed.numbered - current as u64
     }
 

@@ -250,7 +250,7 @@ impl Engine {
         self.device_loads().iter().map(|load| load.queued_frames).sum()
     }
 
-    /// How many sessions have begun and ended so far, together.
+    /// A number that rises by 1 with each session that begins, and with each that ends.
     pub fn session_changes(&self) -> u64 {
         self.devices.changes()
     }
@@ -441,6 +441,8 @@ impl Engine {
     ) -> FrameBytes {
         let is_large = sample_count(views, profile) > limits::LARGE_SAMPLES;
         let backend = self.devices.backend();
+        // Each device has images of its own.
+        let rendered = rendered * self.devices.count() as u64;
         // Only small frames are rendered beside another one, see `render_queue`: of a large frame,
         // its cameras one by one.
         let side_bytes = |views: &[View]| backend.bytes_beside(views, profile) + rendered;
@@ -487,8 +489,8 @@ impl Engine {
         self.devices.run(cost, deadline, work).await
     }
 
-    /// Places a session on the device with the fewest, by a number that its frames are scheduled
-    /// by.
+    /// Places a session on the device with the fewest sessions. Its frames are scheduled by the
+    /// number of the slot.
     pub(crate) fn place_session(&self) -> DeviceSlot {
         self.devices.place()
     }

@@ -34,7 +34,7 @@ impl Turns {
             simulations: Arc::new(Semaphore::new((processors / 2).max(1))),
             records: Arc::new(Semaphore::new(limits::RECORDS_AT_ONCE)),
             overlays: Arc::new(Semaphore::new(limits::OVERLAYS_AT_ONCE)),
-            scenarios: Arc::new(Semaphore::new(limits::SCENARIOS_AT_ONCE)),
+            scenarios: Arc::new(Semaphore::new((processors / 2).max(limits::SCENARIOS_AT_ONCE))),
         }
     }
 

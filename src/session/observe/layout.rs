@@ -471,7 +471,7 @@ impl ObservationLayout {
         let with_normals =
             if self.maps.normals { limits::ANSWER_PIXELS / 2 } else { limits::ANSWER_PIXELS };
         let has_owners = self.maps.instances || self.maps.semantics;
-        // With instances or classes a pixel takes 4/3 of the bytes.
+        // With instances or classes a pixel counts 4/3; it takes at most 14/11 of the bytes.
         if has_owners { with_normals / 4 * 3 } else { with_normals }
     }
 

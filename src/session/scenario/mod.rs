@@ -76,7 +76,10 @@ impl SessionScenario {
         let assets = StoredAssets::sharing(cache.catalog(), self.generated.clone());
         // Pinned, never the latest: all episodes of a session play in the same files.
         let loaded = self.scenarios.resolve(file, seed, pinned, false, &assets)?;
-        let share = engine.answer_budget().reserve(loaded.memory_bytes)?;
+        let share = engine
+            .answer_budget()
+            .reserve(loaded.memory_bytes)
+            .map_err(|_| SessionError::Busy { what: "too little memory is left for scenarios" })?;
         let actors = loaded.scenario.traffic.actors.iter();
         let assets = ActorAssets::load(cache, actors.map(|actor| actor.spec.asset.as_deref()))?;
         let assets = assets.with_share(share);

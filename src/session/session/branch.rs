@@ -34,7 +34,10 @@ impl Session {
     /// # Errors
     /// There are too many snapshots, or too little memory for the state.
     pub fn take_snapshot(&self, name: String) -> Result<(), SessionError> {
-        let share = self.engine.answer_budget().reserve(self.state.copied_bytes())?;
+        let share =
+            self.engine.answer_budget().reserve(self.state.copied_bytes()).map_err(|_| {
+                SessionError::Busy { what: "too little memory is left for snapshots" }
+            })?;
         self.snapshots.store(name, self.present(share))
     }
 

@@ -375,13 +375,22 @@ impl Session {
 
     /// Ends the session and summarizes its last episode.
     pub async fn close(mut self, outcome: Outcome) -> EpisodeSummary {
-        self.end_recording(outcome).await;
-        let summary = self.state.episode.summary(outcome);
-        // Millions of small values may be freed, which must not hold up an async thread. It is
-        // waited for, so that the next session has the memory of this one; a panic would only lose
-        // that.
-        let _ = run_blocking(move || drop(self)).await;
+        let summary = self.end(outcome).await;
+        self.free().await;
         summary
+    }
+
+    /// Ends the episode, and completes its record.
+    pub async fn end(&mut self, outcome: Outcome) -> EpisodeSummary {
+        self.end_recording(outcome).await;
+        self.state.episode.summary(outcome)
+    }
+
+    /// Frees all memory of the session, and returns when the next one has it.
+    pub async fn free(self) {
+        // Millions of small values may be freed, which must not hold up an async thread. A panic
+        // would only lose memory.
+        let _ = run_blocking(move || drop(self)).await;
     }
 
     /// Renders captures of a version one after the other, each scheduled among the other sessions'

@@ -116,6 +116,11 @@ impl Course {
         Self::new(self.poses.iter().rev().map(turned).collect(), stations_m.collect())
     }
 
+    /// Number of its places.
+    pub fn places(&self) -> usize {
+        self.poses.len()
+    }
+
     /// Length of the way through the poses, in metres; above 0.
     pub fn length_m(&self) -> f64 {
         self.stations_m[self.stations_m.len() - 1]

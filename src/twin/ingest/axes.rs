@@ -177,8 +177,8 @@ impl Axes {
             let turned = rotation * DQuat::from_xyzw(x, y, z, w);
             *quat = [turned.w, turned.x, turned.y, turned.z].map(|q| q as f32);
         }
-        // SH of odd degree change their sign under a reflection, so the colours need the matrix
-        // itself.
+        // The negative of the matrix would change the sign of SH of odd degree, so the colours need
+        // the matrix itself.
         let turn = sh::ShRotation::new(matrix, gaussians.sh_degree);
         for colour in gaussians.sh.chunks_exact_mut(3 * sh::coefficients(gaussians.sh_degree)) {
             turn.apply(colour);

@@ -193,8 +193,8 @@ fn check(entry: Entry) -> Result<ListedCamera, CamerasError> {
     if let Some(stops) = refused_stops(exposure_stops) {
         return Err(CamerasError::Stops { name, stops });
     }
-    // These describe a motion during the image, or a part of a vehicle: neither exists without a
-    // rig.
+    // These describe a motion during the image, a change of its colours, or a part of a vehicle. A
+    // camera of a list has none; its exposure is `exposure_stops`.
     let of_rigs = [
         ("shutter", entry.shutter.is_some()),
         ("exposure", entry.exposure.is_some()),

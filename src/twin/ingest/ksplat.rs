@@ -181,7 +181,10 @@ impl Section {
         } else {
             // Not one by one: buckets may have no bytes, and there may be four billion of them.
             let bytes = u64::from(self.buckets) * u64::from(self.bucket_bytes);
-            io::copy(&mut input.by_ref().take(bytes), &mut io::sink())?;
+            let read = io::copy(&mut input.by_ref().take(bytes), &mut io::sink())?;
+            if read < bytes {
+                return Err(io::Error::from(io::ErrorKind::UnexpectedEof).into());
+            }
         }
         let mut gaussians = Gaussians::with_capacity(self.sh_degree, self.count as usize);
         let mut record = vec![0; self.record_bytes];

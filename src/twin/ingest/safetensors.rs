@@ -70,8 +70,8 @@ fn read_tensors(
                 let of_tensor = tensor.shape[1];
                 let mut row = 0;
                 body.rows(tensor, |rgb: [f64; 3]| {
-                    // Row r of the tensor has coefficient r mod K of Gaussian r / K, for K
-                    // coefficients a Gaussian.
+                    // Row r of the tensor has its coefficient r mod K of Gaussian r / K. K is
+                    // `of_tensor`, and not the number of coefficients in memory.
                     let at = 3 * (row / of_tensor * coefficients + first + row % of_tensor);
                     g.sh[at..at + 3].copy_from_slice(&rgb.map(|c| c as f32));
                     row += 1;

@@ -164,8 +164,7 @@ impl<'a> CellPacker<'a> {
                 runs.clone().map(kept).collect()
             }
             Source::Consumed(blocks) => {
-                // Batches come in the order of the blocks, so that those of this one are at the
-                // front.
+                // Batches come in the order of the blocks, so this batch's blocks are in front.
                 blocks.drain(..runs.clone().count()).map(BlockParts::Consumed).collect()
             }
         };

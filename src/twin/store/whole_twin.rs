@@ -28,8 +28,8 @@ impl Catalog {
     /// # Errors
     /// [`StoreError::TwinExists`]; [`StoreError::Leased`] if a version is in use;
     /// [`StoreError::Conflict`] if a version was committed meanwhile; a version cannot be read, or
-    /// its copy cannot be written. Then the old twin is whole, and the new one has the versions up
-    /// to there.
+    /// its copy cannot be written. Then the old twin is whole, and the new one has what was copied.
+    /// If the old twin cannot be removed, the new one is whole: [`Catalog::remove`] the old one.
     pub fn rename(&self, from: &str, to: &str) -> Result<Version, StoreError> {
         self.check_new(to)?;
         self.check_unused(from)?;

@@ -156,8 +156,7 @@ impl Align {
         let ground = found.with_context(|| format!("twin {}", self.edited.twin.name))?;
         let height = cameras.map(|cameras| cameras.height_above(&ground));
         let scale = match (self.camera_height_m, height) {
-            // The cameras are one height above the ground in units of the twin: the wanted one
-            // gives the scale.
+            // `height` is that of the cameras in units of the twin; the wanted one is in metres.
             (Some(height_m), Some(height)) => height_m / height,
             _ => metres_per_unit,
         };

@@ -126,7 +126,7 @@ impl Sector {
             let [low, high] = azimuths(column);
             let wider = [span[0].min(low), span[1].max(high)];
             let is_full = column - start == MOST_COLUMNS || wider[1] - wider[0] > MOST_RAD;
-            // One column is always taken, however far the offsets of its rows spread it.
+            // One column is always taken. The offsets of its rows spread it by at most 1 rad.
             if is_full && column > start {
                 sectors.push(Self::new(rows.clone(), view, start..column, span, &azimuths));
                 start = column;

@@ -68,7 +68,7 @@ impl Chain {
         cull: &ThreadPool,
     ) -> Result<Turn, RenderError> {
         let rows = TileRows::from_frame(frame);
-        // A frame of this kind did not fit at once, and this one would hardly do.
+        // A frame of this kind did not fit at once, and this one would hardly fit either.
         if self.partitions.get(&PartitionKey::from_frame(frame), &rows).len() > 1 {
             return Ok(Turn::Drawn(self.draw(frame, outputs, cull)?));
         }

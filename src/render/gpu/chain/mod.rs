@@ -192,9 +192,9 @@ impl Chain {
         let device = &self.device;
         self.timestamps.reserve(device, TIMESTAMP_BYTES);
         let kernels = self.sweeps.get_or_insert_with(|| SweepKernels::new(device));
-        device.check()?;
         // A shader that does not compile is an error of this sweep, and not of the device's next
         // frame.
+        device.check()?;
         kernels.sweep(device, self.timestamps.buffer(), pool, task)
     }
 

@@ -93,8 +93,8 @@ impl World {
         }
     }
 
-    /// Bytes that a copy does not share with its original, but for the values that conditions
-    /// remember.
+    /// Bytes that a copy does not share with its original, without the values that conditions
+    /// remember, and without the triggers that are under way or fired in the last step.
     pub fn copied_bytes(&self) -> usize {
         let triggers: usize = self.progress.iter().map(|actor| actor.fired.len()).sum();
         size_of_val(&*self.states)

@@ -88,12 +88,12 @@ impl Commit {
         match (&change.sky, change.profile) {
             (Some(Some(sky)), profile) => sky.check(&profile.unwrap_or(base.manifest.profile))?,
             // The sky that is kept, too: no session could open a version whose sky is too coarse.
-            (None, Some(profile)) => {
+            (None, Some(profile)) if profile.sky_error != base.manifest.profile.sky_error => {
                 if let Some(sky) = self.catalog.sky(&base)? {
                     sky.drawable(profile.sky_error).map_err(IngestError::Sky)?;
                 }
             }
-            (Some(None), _) | (None, None) => {}
+            (Some(None) | None, _) => {}
         }
         self.publish(Some(base.number), |commit, latest| match latest {
             Some(latest) if latest != base.number => {

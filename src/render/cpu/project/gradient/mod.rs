@@ -92,7 +92,7 @@ fn back_project_unit<S: Simd>(
     let mut twist = [0.0_f64; 6];
     let mut next = by_splats.iter();
     for (k, cluster) in (job.clusters.clone()).zip(&job.chunk.clusters()[job.clusters.clone()]) {
-        // The test of the way there: the splats must be the same ones.
+        // The test that the forward pass makes: the splats must be the same ones.
         if !job.projection.may_see(job.chunk, cluster) {
             continue;
         }
