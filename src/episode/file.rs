@@ -188,6 +188,11 @@ impl EpisodeFile {
         Some(entry.get("name")?.as_str()?.to_owned())
     }
 
+    /// The name of a trigger, or its index if it has none.
+    pub fn trigger_text(&self, actor: &str, trigger: u32) -> String {
+        self.trigger_name(actor, trigger).unwrap_or_else(|| trigger.to_string())
+    }
+
     /// The triggers that did not fire: the name of the actor, and the index in its script.
     pub fn unfired_triggers(&self) -> Vec<(&str, u32)> {
         let has_fired = |index: usize, at: u32| {
@@ -219,8 +224,7 @@ impl EpisodeFile {
             _ => None,
         });
         let unfired = self.unfired_triggers().into_iter().map(|(actor, trigger)| {
-            let name = self.trigger_name(actor, trigger).unwrap_or_else(|| trigger.to_string());
-            format!("trigger {name} of {actor} did not fire")
+            format!("trigger {} of {actor} did not fire", self.trigger_text(actor, trigger))
         });
         overlaps.chain(unfired).collect()
     }

@@ -82,7 +82,7 @@ pub const INLINE_REQUEST_BYTES: usize = 16 << 10;
 pub const PARSED_AT_ONCE: usize = 4;
 
 /// Bytes of WebSocket messages that were begun and have not ended, on all connections.
-pub const UNFINISHED_BYTES: u64 = 256 << 20;
+pub const UNFINISHED_BYTES: usize = 256 << 20;
 
 /// Messages up to this length are written into shared memory at once, on the thread of the
 /// connection: 256 KiB take about 0.1 ms. Longer ones are written on a thread that may block.
@@ -168,9 +168,15 @@ pub const DRIVES_AT_ONCE: usize = 2;
 /// Time between two looks for records that are beyond a limit: each lists the directory.
 pub const PRUNE_PERIOD: Duration = Duration::from_secs(60);
 
-/// Share of all sessions, and of all connections, that a token without a limit of its own leaves to
-/// others: one in four.
+/// Share of all sessions, connections and unfinished messages that a token without a limit of its
+/// own leaves to others: one in four.
 pub const LEFT_TO_OTHERS: usize = 4;
+
+/// What a token may have of `all` that there is. All clients of a server without tokens, where the
+/// name is empty, are one owner and have all.
+pub fn share_of_token(token: &str, all: usize) -> usize {
+    if token.is_empty() { all } else { all - all / LEFT_TO_OTHERS }
+}
 
 /// Recorded episodes that are listed over HTTP: each file is read for it.
 pub const LISTED_EPISODES: usize = 100;

@@ -201,10 +201,8 @@ impl SessionRegistry {
         }
         // There are at most some hundred sessions.
         let own = entries.values().filter(|entry| entry.owner == grant.name).count();
-        // All clients of a server without tokens are one owner, and have all sessions.
-        let left_to_others =
-            if grant.name.is_empty() { 0 } else { self.limit / limits::LEFT_TO_OTHERS };
-        let limit = grant.limits.sessions.unwrap_or(self.limit - left_to_others);
+        let share = || limits::share_of_token(&grant.name, self.limit);
+        let limit = grant.limits.sessions.unwrap_or_else(share);
         if own >= limit {
             return Err(Fault::Busy { what: "sessions of this token", limit });
         }

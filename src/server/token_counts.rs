@@ -35,10 +35,9 @@ impl TokenCounts {
     /// # Errors
     /// [`Fault::Busy`]: the token's limit is reached.
     pub(crate) fn connection(&self, grant: &Grant, all: usize) -> Result<Counted, Fault> {
-        // All clients of a server without tokens are one owner, and have all connections.
-        let share = (!grant.name.is_empty()).then(|| all - all / limits::LEFT_TO_OTHERS);
-        let limit = grant.limits.connections.or(share);
-        self.begin(grant, limit, "connections of this token")
+        let share = || limits::share_of_token(&grant.name, all);
+        let limit = grant.limits.connections.unwrap_or_else(share);
+        self.begin(grant, Some(limit), "connections of this token")
     }
 
     fn begin(

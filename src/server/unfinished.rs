@@ -15,9 +15,9 @@ pub(crate) struct Unfinished(Mutex<Sums>);
 
 #[derive(Debug, Default)]
 struct Sums {
-    all: u64,
+    all: usize,
     /// By token, those that have some.
-    tokens: BTreeMap<String, u64>,
+    tokens: BTreeMap<String, usize>,
 }
 
 /// Bytes of the unfinished message of one connection.
@@ -25,11 +25,11 @@ struct Sums {
 pub(crate) struct OwnUnfinished {
     all: Arc<Unfinished>,
     token: String,
-    own: u64,
+    own: usize,
 }
 
 /// Bytes of a control frame of a client beside its payload: two, and four of the mask.
-const CONTROL_FRAME: u64 = 6;
+const CONTROL_FRAME: usize = 6;
 
 impl OwnUnfinished {
     /// Of a connection of a token, whose name is empty on a server without tokens.
@@ -43,23 +43,14 @@ impl OwnUnfinished {
     /// All connections together, or those of the token, have begun too much, and this one more than
     /// a request usually has.
     pub(crate) fn received(&mut self, bytes: usize) -> io::Result<()> {
-        let bytes = bytes as u64;
         self.own += bytes;
         let mut sums = self.all.0.lock();
         sums.all += bytes;
-        // Without a copy of the name, but for the first bytes.
-        if !sums.tokens.contains_key(&self.token) {
-            sums.tokens.insert(self.token.clone(), 0);
-        }
-        let of_token = sums.tokens.get_mut(&self.token).map_or(bytes, |of_token| {
-            *of_token += bytes;
-            *of_token
-        });
-        // A token leaves some to others; without tokens there are none.
-        let left = if self.token.is_empty() { 0 } else { limits::UNFINISHED_BYTES / 4 };
-        let is_over =
-            of_token > limits::UNFINISHED_BYTES - left || sums.all > limits::UNFINISHED_BYTES;
-        if is_over && self.own > limits::INLINE_REQUEST_BYTES as u64 {
+        let of_token = sums.tokens.entry(self.token.clone()).or_default();
+        *of_token += bytes;
+        let is_over = *of_token > limits::share_of_token(&self.token, limits::UNFINISHED_BYTES)
+            || sums.all > limits::UNFINISHED_BYTES;
+        if is_over && self.own > limits::INLINE_REQUEST_BYTES {
             return Err(io::Error::from(io::ErrorKind::QuotaExceeded));
         }
         Ok(())
@@ -67,7 +58,7 @@ impl OwnUnfinished {
 
     /// A ping or a pong arrived, which may lie within a message.
     pub(crate) fn control_frame(&mut self, payload: usize) {
-        self.free(payload as u64 + CONTROL_FRAME);
+        self.free(payload + CONTROL_FRAME);
     }
 
     /// A message arrived whole.
@@ -80,7 +71,7 @@ impl OwnUnfinished {
         self.own > 0
     }
 
-    fn free(&mut self, bytes: u64) {
+    fn free(&mut self, bytes: usize) {
         // The bytes of a frame that HTTP had read ahead were never counted.
         let freed = bytes.min(self.own);
         self.own -= freed;
@@ -110,7 +101,7 @@ mod tests {
     fn what_was_begun_counts_until_it_ends_or_its_connection_does() {
         let all = Arc::new(Unfinished::default());
         let of = |token: &str| OwnUnfinished::new(all.clone(), token.to_owned());
-        let most = limits::UNFINISHED_BYTES as usize;
+        let most = limits::UNFINISHED_BYTES;
         let mut long = of("");
         long.received(most).unwrap();
         let mut next = of("");
@@ -121,7 +112,7 @@ mod tests {
         next.message_ended();
         assert!(!next.is_within_message());
         // A ping within a message is no part of it.
-        long.received(CONTROL_FRAME as usize + 3).unwrap_err();
+        long.received(CONTROL_FRAME + 3).unwrap_err();
         long.control_frame(3);
         assert_eq!(all.0.lock().all, limits::UNFINISHED_BYTES);
         drop(long);

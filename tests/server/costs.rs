@@ -189,7 +189,7 @@ async fn scenarios_and_snapshots_count() {
     let before = counted();
     let mut agent = server.agent().await;
     let mut scenario = crowd();
-    // It never fires.
+    // After the end of what is driven here.
     let never = json!([{ "when": { "time_s": 99 }, "do": [{ "remove": {} }] }]);
     for actor in scenario["actors"].as_array_mut().unwrap() {
         actor["script"] = never.clone();

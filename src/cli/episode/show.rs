@@ -35,7 +35,7 @@ impl Show {
             writeln!(out, "{:<11} {seconds:.3} s {}", "event", text(&line.event, &episode))?;
         }
         for (actor, trigger) in episode.unfired_triggers() {
-            writeln!(out, "not fired   {actor}: trigger {}", named(&episode, actor, trigger))?;
+            writeln!(out, "not fired   {actor}: trigger {}", episode.trigger_text(actor, trigger))?;
         }
         match &episode.end {
             Some(end) => writeln!(
@@ -95,11 +95,6 @@ fn head(out: &mut impl Write, episode: &EpisodeFile) -> io::Result<()> {
     Ok(())
 }
 
-/// The name of a trigger, or its index if it has none.
-fn named(episode: &EpisodeFile, actor: &str, trigger: u32) -> String {
-    episode.trigger_name(actor, trigger).unwrap_or(trigger.to_string())
-}
-
 fn text(event: &Event, episode: &EpisodeFile) -> String {
     // An index of a damaged record may be of no actor: then the number is shown.
     let name = |index: u16| {
@@ -125,7 +120,7 @@ fn text(event: &Event, episode: &EpisodeFile) -> String {
         Event::OffModel { trust } => format!("left the trained area: trust {trust:.3}"),
         Event::Triggered { actor, trigger } => {
             let actor = name(*actor);
-            format!("{actor} fires trigger {}", named(episode, &actor, *trigger))
+            format!("{actor} fires trigger {}", episode.trigger_text(&actor, *trigger))
         }
         Event::Appeared { actor } => format!("{} appears", name(*actor)),
         Event::Left { actor } => format!("{} leaves", name(*actor)),

@@ -24,7 +24,7 @@ pub(crate) struct Devices {
 /// Which device has how many sessions.
 #[derive(Debug)]
 struct Placed {
-    /// By device.
+    /// How many each device has.
     sessions: Vec<usize>,
     /// Sessions so far, the frames of pushes among them.
     numbered: u64,

@@ -42,7 +42,7 @@ use self::render_queue::{FrameCost, Scratch};
 use self::solid_blocks::SolidBlocks;
 use self::turns::{Turn, Turns};
 use self::twin_summaries::{SummaryCache, TwinSummaries};
-use crate::blocking::run_blocking;
+use crate::blocking::{Stop, run_blocking, run_until};
 use crate::contact::TwinSolids;
 use crate::error::SessionError;
 use crate::limits;
@@ -173,12 +173,24 @@ impl Engine {
         self.turns.overlay(Instant::now() + self.step_timeout).await
     }
 
-    /// Waits for the turn to read and resolve a scenario.
+    /// Waits for the turn to read and resolve a scenario, and does it until the time of a step has
+    /// passed.
     ///
     /// # Errors
-    /// [`SessionError::DeadlineExceeded`].
-    pub(crate) async fn scenario_turn(&self, deadline: Instant) -> Result<Turn, SessionError> {
-        self.turns.scenario(deadline).await
+    /// [`SessionError::DeadlineExceeded`], or that of the work.
+    pub(crate) async fn in_scenario_turn<T: Send + 'static>(
+        &self,
+        work: impl FnOnce(&Stop) -> Result<T, SessionError> + Send + 'static,
+    ) -> Result<T, SessionError> {
+        let deadline = Instant::now() + self.step_timeout;
+        let turn = self.turns.scenario(deadline).await?;
+        run_until(deadline, move |stop| {
+            // The turn belongs to the work, which goes on for a moment if the client leaves.
+            let _turn = turn;
+            stop.refusal()?;
+            work(stop)
+        })
+        .await
     }
 
     /// Waits for the turn to read a whole record.

@@ -27,7 +27,7 @@ use wildcity_twin::residency::{
 };
 
 use super::Session;
-use crate::blocking::{run_blocking, run_until};
+use crate::blocking::{Stop, run_blocking};
 use crate::engine::Engine;
 use crate::error::SessionError;
 use crate::limits;
@@ -505,21 +505,17 @@ impl OpenedScenario {
         let seed = asked.seed;
         // A start that the request names is that of all its episodes, whatever the scenario says.
         let gives_start = asked.start.is_none();
-        let deadline = Instant::now() + engine.step_timeout();
-        let turn = engine.scenario_turn(deadline).await?;
-        run_until(deadline, move |stop| {
-            // The turn belongs to the work, which goes on for a moment if the client leaves.
-            let _turn = turn;
+        let turns = engine.clone();
+        let read = move |stop: &Stop| {
             let scenarios = engine.scenarios().clone();
-            stop.refusal()?;
             let mut scenario = SessionScenario::read(scenarios, &source, &values, gives_start)?;
             stop.refusal()?;
             let episode = scenario.for_episode(seed, &version, &engine)?;
             check_line(&episode.loaded, &version.manifest)?;
             scenario.pin_assets(&episode.loaded);
             Ok(Self { scenario, episode })
-        })
-        .await
+        };
+        turns.in_scenario_turn(read).await
     }
 
     fn resolved(&self) -> &Scenario {

@@ -301,14 +301,8 @@ impl Session {
                 let scenario = scenario.clone();
                 let version = self.resident().version.clone();
                 let engine = self.engine.clone();
-                let deadline = Instant::now() + engine.step_timeout();
-                let turn = engine.scenario_turn(deadline).await?;
-                let find = move |stop: &Stop| {
-                    let _turn = turn;
-                    stop.refusal()?;
-                    scenario.for_episode(seed, &version, &engine)
-                };
-                Some(run_until(deadline, find).await?)
+                let find = move |_: &Stop| scenario.for_episode(seed, &version, &engine);
+                Some(self.engine.in_scenario_turn(find).await?)
             }
         };
         // The request, then the session's random start, then the scenario. Without any, the
